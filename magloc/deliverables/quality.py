@@ -88,16 +88,22 @@ class Quality(Result):
     Attributes
     ----------
     array : SensorArray
+        Array with the stated noise.
     time_s : ndarray, shape (n,)
+        Times of the rows.
     place_m : ndarray, shape (n, 3)
+        Places of the array's origin in the world frame, interpolated between fixes.
     height_m : ndarray, shape (n,)
         Height of the array's origin above the ground.
     gaps : Gaps
+        Intervals longer than three usual ones.
     lines_flown : list of FlightLine
+        Lines in the order of time.
     fourth_T : ndarray, shape (n, N)
         Fourth difference of each sensor's modulus, divided by √70: white noise keeps its standard deviation. NaN beside
         gaps and unusable readings.
     missing, stuck, spikes : ndarray of bool, shape (n, N)
+        Readings that a survey leaves out.
     heading : list of HeadingError or None
         For each sensor; None if the lines do not determine it.
     lag : ClockLag, optional
@@ -275,6 +281,7 @@ def check_quality(
     Parameters
     ----------
     array : SensorArray
+        States the noise of the sensors.
     readings : Readings or sequence of them
         In order of time, with the pose of the array. For the lag scalar sensors need the ambient field.
     ground_m : float or Terrain
@@ -283,6 +290,7 @@ def check_quality(
     Returns
     -------
     Quality
+        Its ``checks`` are the rows of the table, its ``flags`` the names of faults.
 
     Raises
     ------
@@ -317,13 +325,14 @@ def check_quality(
     ground = Ground(NOTHING_KNOWN, terrain, _SHORTEST_GEOLOGY_M, math.inf)
     stuck, spikes, unusable = unusable_readings(array, rows, ground.shallowest_m, terrain)
     moduli_T = np.where(unusable, np.nan, field_moduli(array, rows.values_T))
-    lines = flight_lines(rows.time_s, place_m, -terrain.depth_of(place_m))
+    height_m = -terrain.depth_of(place_m)
+    lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
     coverage = _coverage(place_m[:, :2], lines)
     return Quality(
         array,
         rows.time_s,
         place_m,
-        -terrain.depth_of(place_m),
+        height_m,
         _gaps(rows.time_s, place_m),
         lines,
         _fourth_differences(rows.time_s, moduli_T),

@@ -8,13 +8,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-import arrays
 import magloc
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_file, write_files
 from arrays.typing import Vector
 from magloc.cli.framework import Flag, QuietOptions, print_report
-from magloc.cli.options import KnownOptions, ambient_field
+from magloc.cli.options import KnownOptions, LogOptions, ambient_field
 from magloc.cli.surveys.ground import SurfaceOptions
 
 
@@ -22,7 +21,7 @@ def qc(
     readings: Annotated[list[Path], Parameter(negative_iterable="")],
     /,
     *,
-    array: Path,
+    log: LogOptions = LogOptions(),  # noqa: B008 - frozen
     surface: SurfaceOptions = SurfaceOptions(),  # noqa: B008 - frozen
     sensors: str | None = None,
     place: Vector | None = None,
@@ -41,8 +40,8 @@ def qc(
     ----------
     readings : list of Path
         Readings files (CSV), in order of time.
-    array : Path
-        Array file (TOML).
+    log : LogOptions
+        Sensors and columns of the readings: --array or --instrument.
     surface : SurfaceOptions
         Surface of the ground.
     sensors : str
@@ -62,13 +61,13 @@ def qc(
     refuse_file(out, "--out")
     surface.refuse()
     known = KnownOptions(sensors=sensors, place=place, date=date)
-    used, known = known.on_earth(known.select(arrays.read_sensors(array), array), readings[0])
+    used, known = known.on_earth(known.select(log.sensors(readings[0]), log.name), readings[0])
     where = None if known.place is None or known.date is None else known.where
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     ground, parts, _ = surface.below(readings, parts, used, known.place)
     fields = [ambient_field(used, part, where) for part in parts]
     rows = [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
-    with naming(", ".join(map(str, readings)), array=str(array)):
+    with naming(", ".join(map(str, readings)), array=log.name):
         quality = magloc.check_quality(fields[0][0], rows, ground_m=ground)
     write_files(out, _files(quality) if out is not None else ())
     if json:
