@@ -76,7 +76,7 @@ def compensate(
     is_same = calibration is None
     flown = readings if calibration is None else calibration
     own = columns_of(currents if is_same else calibration_currents, names, len(flown))
-    mean = np.nanmean(own, axis=0) if names else np.zeros(0)
+    mean = np.nan_to_num(own).sum(axis=0) / np.maximum(np.isfinite(own).sum(axis=0), 1)
     log = PlatformLog.of(array, flown, own - mean)
     terms = {sensor.id: PlatformTerms.of(sensor, names, current_sigma_T) for sensor in array.sensors}
     fits = _fit_all(log, terms)

@@ -242,6 +242,11 @@ class LinearProblem:
             attitude = attitude.without(terms, coefficients, rows.currents)
         known = np.isfinite(attitude.at(rows.time_s + rows.late_s + lag_s)[0]).all(axis=1)
         known &= np.isfinite(currents_at(rows.currents, rows.time_s)).all(axis=1)
+        if known.sum() < FEWEST_ROWS:
+            raise ValueError(
+                f"Input readings must have {FEWEST_ROWS} samples with an attitude and all currents; instead received"
+                f" {known.sum()}."
+            )
         rows = rows[np.asarray(known)]
         currents, modulus = currents_at(rows.currents, rows.time_s), rows.modulus_T
         own = rows.time_s if rows.is_own else None

@@ -76,14 +76,17 @@ class PlatformLog:
                 moduli[sensor.id] = (values[:, channel] - array.channel_offset_T[channel]) / array.channel_gain[
                     channel, 0
                 ]
-        usual = float(np.nanmedian(np.stack(list(moduli.values())))) if moduli else np.nan
+        read = [each[np.isfinite(each) & (each > 0.0)] for each in moduli.values()]
+        usual = float(np.median(np.concatenate(read))) if any(map(len, read)) else np.nan
         signals, factors = {}, {}
         for i, sensor in enumerate(array.sensors):
             if sensor.kind == "scalar":
                 signals[sensor.id] = Signal.of(readings.time_s, moduli[sensor.id][:, None])
                 continue
-            ratio = float(np.nanmedian(np.linalg.norm(fields[:, i], axis=1))) / usual
-            factors[sensor.id] = 1.0 if not moduli or 1.0 / _SAME_UNIT < ratio < _SAME_UNIT else ratio
+            lengths = np.linalg.norm(fields[:, i], axis=1)
+            ratio = float(np.median(lengths[np.isfinite(lengths)])) / usual if np.isfinite(lengths).any() else np.nan
+            is_other = ratio > 0.0 and not 1.0 / _SAME_UNIT < ratio < _SAME_UNIT
+            factors[sensor.id] = ratio if is_other else 1.0
             signals[sensor.id] = Signal.of(readings.time_s, fields[:, i] / factors[sensor.id])
         flowing = None if not currents.shape[1] else Signal.of(readings.time_s, currents)
         jumps = np.nan_to_num(currents - currents_at(flowing, readings.time_s))
@@ -102,7 +105,9 @@ class PlatformLog:
         usable = [
             sensor
             for i, sensor in enumerate(self.array.sensors)
-            if sensor.kind == "vector" and read[self.array.channel_sensor == i].min() > _FEWEST_SHARE
+            if sensor.kind == "vector"
+            and self.signals[sensor.id].stretches
+            and read[self.array.channel_sensor == i].min() > _FEWEST_SHARE
         ]
         return min(usable, key=lambda sensor: sensor.noise_T, default=None)
 
@@ -185,7 +190,11 @@ def _clean(
     place = np.zeros((len(time_s), 3))
     place[:, 0] = time_s * (_STEP_DEPTHS / float(np.median(np.diff(time_s))))
     steps = np.abs(np.diff(currents, axis=0, prepend=currents[:1]))
-    jumps = (steps > _JUMP * np.nanmedian(steps, axis=0)).any(axis=1) if currents.size else np.zeros(len(values), bool)
+    jumps = (
+        (steps > _JUMP * np.median(np.nan_to_num(steps), axis=0)).any(axis=1)
+        if currents.size
+        else np.zeros(len(values), bool)
+    )
     jumps = maximum_filter1d(jumps, 1 + 2 * _BESIDE_JUMP)
     left_out = {}
     for i, sensor in enumerate(array.sensors):

@@ -274,6 +274,15 @@ class TestRefusals:
         with pytest.raises(ValueError, match="in order of time"):
             magloc.compensate(ARRAY, calm().readings[np.arange(200)[::-1]])
 
+    def test_nothing_to_fit(self) -> None:
+        """Frozen sensors, and currents that are never read: one sentence each."""
+        values = calm().readings.values_T.copy()
+        values[:, 0] = 48e-6
+        with pytest.raises(ValueError, match="60 samples of sensor mag"):
+            magloc.compensate(ARRAY, changed(values))
+        with pytest.raises(ValueError, match="60 samples with an attitude and all currents; instead received 0"):
+            magloc.compensate(ARRAY, calm().readings, currents={"i": np.full(3000, np.nan)})
+
     def test_currents_of_another_flight(self) -> None:
         with pytest.raises(ValueError, match="shape"):
             magloc.compensate(ARRAY, calm().readings, currents={"i": np.zeros(7)})
