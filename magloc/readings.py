@@ -278,8 +278,8 @@ def read_readings(
     """
     form = log_format(array, sensors)
     table, error_m = without_gaps(form.table(read_text(path, "a CSV file", form.encoding), str(path)))
-    if array.columns is not None and array.columns.course:
-        table = turned_to_course(table, array.columns)
+    if array.columns is not None:
+        table = turned_to_course(table, array, array.columns)
     readings = replace(readings_of_table(table, array, sensors), interpolated_m=error_m)
     if array.columns is not None and array.columns.pose_latency_s:
         readings = readings.posed_later(array.columns.pose_latency_s)

@@ -29,15 +29,18 @@ _NAMES = {
     "latitude": r"lat(itude)?|breite|gps ?lat(itude)?",
     "longitude": r"lon(g|gitude)?|lng|länge|gps ?lon(gitude)?",
     "height": r"(ell|orth|gps)?[ _.]?(alt(itude)?|height|elev(ation)?|höhe|h)([ _](asl|amsl|msl))?|z|u|up|h[ _]?ell",
-    "above ground": r"(alt(itude)?|height|elev(ation)?|höhe)[ _](agl|(above|over) ground|über grund)|agl|laser",
+    "above ground": r"(alt(itude)?|height|elev(ation)?|höhe)[ _](agl|(above|over) ground|über grund)|agl|hag|laser",
     "east": r"x|e|east(ing)?|rechtswert|rw|utm[ _]?(e|x|east(ing)?)",
     "north": r"y|n|north(ing)?|hochwert|hw|utm[ _]?(n|y|north(ing)?)",
     "valid": r"(mag)?[ _]?valid",
-    "fix": r"fix([ _]?(quality|type))?|gps ?fix|quality",
+    "fix": r"fix([ _]?(quality|type))?|gps ?fix|q(uality)?",
+    "yaw": r"yaw|heading|hdg",
+    "pitch": r"pitch",
+    "roll": r"roll",
 }
 _TIME_OF_DAY = re.compile(r"\d:\d\d")
 _UNIT = re.compile(r"\[.*\]|\(.*\)|nT|[uµ]T|m?T|m?G|[mu]?s|h|m|deg|°C?|V|Hz|-")
-_FIELD = re.compile(r"mag|^b\d*[xyz]?$|field|feld|tmi|^nt|^t?f\d*$", re.IGNORECASE)
+_FIELD = re.compile(r"mag|^b\d*[xyz]?$|field|feld|flux|tmi|^nt|^t?f\d*[xyz]?$", re.IGNORECASE)
 _UNIT_OF_NAME = re.compile(r"^(.*?)[ _]*(?:\[([^\]]*)\]|\(([^)]*)\)|_(nT|uT|mT|T|ms|us|s|m|deg))?$")
 
 
@@ -119,6 +122,7 @@ def propose_columns(path: str | PathLike[str]) -> Proposal:
     _propose_time(header, channels, values, keys, asked)
     _propose_places(header, values, keys, asked)
     sensors = _sensors(header, values, keys, asked)
+    _propose_attitude(header, keys, asked, len(sensors))
     for key in ("valid", "fix"):
         if (flag := _find(header, key)) is not None:
             seen = ", ".join(f"{value:g}" for value in np.unique(values[flag][np.isfinite(values[flag])])[:6])
@@ -265,6 +269,17 @@ def _propose_places(
             asked.append('which grid are these places of? crs = "EPSG:32633" for UTM zone 33 north; and an origin')
         return
     asked.append("no columns of a place were found: position or geodetic")
+
+
+def _propose_attitude(header: Sequence[str], keys: dict[str, object], asked: list[str], sensors: int) -> None:
+    if not {"position", "geodetic"} & keys.keys():
+        return
+    angles = tuple(name for kind in ("yaw", "pitch", "roll") if (name := _find(header, kind)) is not None)
+    if len(angles) == 3 or (angles and angles[0] == _find(header, "yaw")):
+        keys["angles"] = angles if len(angles) == 3 else angles[:1]
+        asked.append(f"are {', '.join(angles)} in degrees, yaw clockwise from north, pitch up, right wing down?")
+    elif sensors > 1:
+        asked.append("the log has no heading: course = true if x of the array points along the course")
 
 
 def _sensors(

@@ -105,8 +105,14 @@ class Attitude:
                 own = terms.fields(cleaned(time), cleaned(time, 1), flowing) @ coefficients
                 cleaned = CubicSpline(time, read - np.nan_to_num(own))
             stretches.append(cleaned)
-        errors = None if covariance is None else AttitudeErrors(terms, np.asarray(np.linalg.cholesky(covariance)))
+        errors = None if covariance is None else AttitudeErrors(terms, root_of(covariance))
         return replace(self, signal=replace(self.signal, stretches=tuple(stretches)), errors=errors)
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return a square root (q, q) of a covariance, whose smallest eigenvalues may be negative by rounding."""
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0)))
 
 
 def currents_at(currents: Signal | None, time_s: FloatArray) -> FloatArray:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
 
+from arrays.array import SensorArray
 from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogColumns
 from arrays.io.csv import Table
 from arrays.logs.places import array_origins
 from arrays.typing import FloatArray
 
+_LOG = logging.getLogger(__name__)
+_APART_M = 0.05  # below it a wrong heading matters no more than errors of places
 CHORD_M = 2.0
 """Length over which the course is measured."""
 
@@ -31,11 +35,21 @@ def chords(xy_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]
     return way, here - before, after - here, chord
 
 
-def turned_to_course(table: Table, columns: LogColumns) -> Table:
+def turned_to_course(table: Table, array: SensorArray, columns: LogColumns) -> Table:
     """Return the table of a log with attitudes whose x axis points along the course, and whose z axis points up.
 
-    Positions of an antenna become those of the array.
+    Positions of an antenna become those of the array. Logs without `course` stay as they are; a warning names those
+    whose sensors are apart on the map but have no attitude.
     """
+    if not columns.course:
+        apart_m = float(np.ptp(array.positions[:, :2], axis=0).max())
+        attitudes = table.values[:, [i for i, name in enumerate(table.header) if name in ROTATION_COLUMNS]]
+        if columns.is_placed and apart_m > _APART_M and (attitudes == [0.0, 0.0, 0.0, 1.0]).all():
+            _LOG.warning(
+                f"{table.path}: found no attitude for sensors that are up to {apart_m:.2g} m apart on the map; x of the"
+                " array counts as east. State angles in the table columns, or course = true if x is ahead"
+            )
+        return table
     at = [table.header.index(name) for name in POSITION_COLUMNS[:2]]
     _, back, forth, _ = chords(table.values[:, at])
     ahead = back + forth

@@ -77,6 +77,13 @@ class TestProposal:
         assert found.sensors == {"s1": ("B1x [uT]", "B1y [uT]", "B1z [uT]")}
         assert found.keys["unit"] == "uT"
 
+    def test_a_drone(self, tmp_path: Path) -> None:
+        """Angles, and a vector sensor beside a scalar one."""
+        head = "UTC,Latitude,Longitude,AGL_m,Yaw,Pitch,Roll,TMI,Fx,Fy,Fz,Motor_A"
+        found = propose_columns(written(tmp_path, head, "{clock},52.4,13.4,{3},90,1,2,{4},{1},{2},{4},12"))
+        assert (found.keys["angles"], found.keys["height_is"]) == (("Yaw", "Pitch", "Roll"), "ground")
+        assert set(found.sensors.values()) == {"TMI", ("Fx", "Fy", "Fz")}
+
     @pytest.mark.parametrize(
         ("head", "row", "words"),
         [
@@ -87,6 +94,8 @@ class TestProposal:
             ("Time,Mag,B", "{clock},{4},{4}", "the date of the first row"),
             ("Time,Mag,B", "12/05/2026 {clock},{4},{4}", "begin with the day"),
             ("time_s,Mag,MagValid", "{0:.1f},{4},1", "which values of MagValid count"),
+            ("time_s,X,Y,HAG,Mag,Q", "{0:.1f},{1},{2},{3},{4},4", "which values of Q count"),
+            ("time_s,X,Y,HAG,Mag1,Mag2", "{0:.1f},{1},{2},{3},{4},{4}", "course = true"),
             ("time_s,A,C", "{0:.1f},{4},1", "no column reads like the Earth's field"),
         ],
     )

@@ -64,3 +64,14 @@ def test_chords_end_and_begin_at_each_row() -> None:
     assert (way[-1], chord) == (pytest.approx(100.0), 2.0)
     np.testing.assert_allclose(back[2:-2], np.tile([2.0, 0.0], (97, 1)), atol=1e-6)
     np.testing.assert_allclose(forth[2:-2], np.tile([2.0, 0.0], (97, 1)), atol=1e-6)
+
+    @pytest.mark.parametrize("course", [False, True])
+    def test_sensors_apart_without_an_attitude(
+        self, *, course: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """Two sensors 1.5 m apart, of which nobody says which way they point."""
+        (tmp_path / "log.csv").write_text("time_s,a,b,E,N,H\n" + "".join(f"{k},1,1,{k},0,0\n" for k in range(9)))
+        columns = arrays.LogColumns(sensors={"a": "a", "b": "b"}, position=("E", "N", "H"), course=course)
+        pair = [arrays.Sensor(name, "scalar", (0.0, y, 0.0), 1e-10) for name, y in (("a", 0.75), ("b", -0.75))]
+        magloc.read_readings(tmp_path / "log.csv", arrays.SensorArray(pair, columns=columns))
+        assert ("no attitude for sensors that are up to 1.5 m apart" in caplog.text) != course
