@@ -29,7 +29,8 @@ def imu(
 ) -> None:
     """Estimate the attitude of an inertial unit, with or without iron and magnets near its magnetometer.
 
-    The unit should be at rest during the first second; its field then defines north. Without a magnetometer the heading
+    The unit should be at rest during the first second; its field then defines north, the magnetic
+    one. Without a magnetometer the heading
     is relative to the first row. During gaps σ grows, and the gaps are reported. A log with wrong units or axes is
     refused. --out writes attitude.csv and attitude.png.
 

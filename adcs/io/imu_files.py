@@ -160,9 +160,12 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
     if named is None:
         table = read_table(path, expected)
         given = _standard(table.header)
-        for group in _layout(given).columns.values():
-            for name in group.columns:
-                table.require(name, group.columns)
+        try:
+            for group in _layout(given).columns.values():
+                for name in group.columns:
+                    table.require(name, group.columns)
+        except InputError as error:
+            raise InputError(f"{str(error).removesuffix('.')}; a layout (--config) names other columns.") from None
     else:
         given = named
         more = () if given.moving is None else (given.moving,)

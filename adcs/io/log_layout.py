@@ -19,7 +19,8 @@ MOMENTUM_UNITS = {"Nms": 1.0, "mNms": 1e-3}
 MOMENT_UNITS = {"Am2": 1.0, "mAm2": 1e-3}
 ACCELERATION_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
 _SI = {**FIELD_UNITS, **RATE_UNITS, **MOMENTUM_UNITS, **MOMENT_UNITS, **ACCELERATION_UNITS}  # all names differ
-TIME_FORMATS = ("seconds", "utc", "unix")
+_SECONDS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6}
+TIME_FORMATS = (*_SECONDS, "utc", "unix")
 ORDERS = ("scalar-first", "scalar-last")
 DIRECTIONS = ("inertial-from-body", "body-from-inertial")
 _ALONG: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -132,7 +133,8 @@ class LogLayout:
     time : str
         Column of the time.
     time_format : str
-        ``seconds`` since the start, ``utc`` (ISO 8601) or ``unix`` (seconds since 1970).
+        ``seconds``, ``milliseconds`` or ``microseconds`` since the start, ``utc`` (ISO 8601) or ``unix`` (seconds since
+        1970).
     columns : dict
         Columns and their conventions by argument of :class:`adcs.Telemetry`.
     """
@@ -153,6 +155,6 @@ class LogLayout:
 
     def seconds(self, values: FloatArray) -> FloatArray:
         """Return times as seconds since the start."""
-        if self.time_format == "seconds":
-            return values
+        if self.time_format in _SECONDS:
+            return values * _SECONDS[self.time_format]
         return values - (self.start - np.datetime64("1970-01-01", "us")) / np.timedelta64(1, "s")

@@ -13,18 +13,21 @@ from arrays.typing import FloatArray
 from magloc.plots import style
 
 _MOST_POINTS = 4000
+_GAP_STEPS = 20.0  # usual steps; no line crosses a longer gap
 
 
 def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None = None) -> Figure:
     """Draw yaw, pitch and roll, and σ of heading and tilt, with errors by a truth (n, 4)."""
     every = slice(None, None, max(1, len(track) // _MOST_POINTS))
     time_s = track.time_s[every]
+    steps_s = np.diff(time_s, prepend=time_s[0])
+    is_gap = steps_s > _GAP_STEPS * np.median(steps_s)
     figure = style.new_figure(5.2)
     above, heading, tilt = figure.subplots(3, 1, sharex=True, height_ratios=[3, 2, 2])
     angles = quaternion.to_rotation(track.q[every]).as_euler("ZYX", degrees=True)
     for values, word, (_, colour, _, line) in zip(angles.T, ("yaw", "pitch", "roll"), style.COMPONENTS, strict=True):
         is_wrap = np.abs(np.diff(values, prepend=values[0])) > 180.0
-        above.plot(time_s, np.where(is_wrap, np.nan, values), color=colour, ls=line, lw=0.9, label=word)
+        above.plot(time_s, np.where(is_wrap | is_gap, np.nan, values), color=colour, ls=line, lw=0.9, label=word)
     style.label_axes(above, "", "angle [°]", "east, north, up from body: yaw, pitch, roll")
     sigma = np.degrees(track.sigma["level"][every])
     errors = None if q_true is None else [np.degrees(e) for e in error_angles(track.q[every], q_true[every])[1:]]
@@ -33,8 +36,8 @@ def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None =
     ):
         if errors is not None:
             shown = (errors[i] + 180.0) % 360.0 - 180.0
-            ax.plot(time_s, np.abs(shown), color=style.BLUE, lw=0.7, label="error")
-        ax.plot(time_s, values, color=style.ORANGE, lw=1.1, ls="--", label="σ")
+            ax.plot(time_s, np.where(is_gap, np.nan, np.abs(shown)), color=style.BLUE, lw=0.7, label="error")
+        ax.plot(time_s, np.where(is_gap, np.nan, values), color=style.ORANGE, lw=1.1, ls="--", label="σ")
         ax.set_ylim(bottom=0.0)
         style.label_axes(ax, "", f"{word} [°]")
         style.add_legend(ax)

@@ -23,9 +23,10 @@ _MARKS = ("#", "/", "!", "%")
 _LINE_NAME = re.compile(r"(/?(?:line|tie|l|t))\s*-?(?:(?<=\s)[A-Za-z]?)\d[\w.:-]*\s*$", re.IGNORECASE)
 _MONTHS = 12
 _EARTH_nT = (20e3, 70e3)
+_LARGEST_nT = 2e9  # no magnet has more beside it
 _NAMES = {
     "date": r"date|datum|gps ?date|utc ?date",
-    "time": r"(gps|utc|system)?[ _]?(time|timestamp|uhrzeit|zeit|clock|counter|utc|tow|seconds)|t|tow",
+    "time": r"(gps|utc|system)?[ _]?(time|timestamp|uhrzeit|zeit|clock|counter|utc|tow|seconds)|t|tow|millis|micros",
     "latitude": r"lat(itude)?|breite|gps ?lat(itude)?",
     "longitude": r"lon(g|gitude)?|lng|länge|gps ?lon(gitude)?",
     "height": r"(ell|orth|gps)?[ _.]?(alt(itude)?|height|elev(ation)?|höhe|h)([ _](asl|amsl|msl))?|z|u|up|h[ _]?ell",
@@ -41,7 +42,9 @@ _NAMES = {
 _TIME_OF_DAY = re.compile(r"\d:\d\d")
 _UNIT = re.compile(r"\[.*\]|\(.*\)|nT|[uµ]T|m?T|m?G|[mu]?s|h|m|deg|°C?|V|Hz|-")
 _FIELD = re.compile(r"mag|^b\d*[xyz]?$|field|feld|flux|tmi|^nt|^t?f\d*[xyz]?$", re.IGNORECASE)
-_UNIT_OF_NAME = re.compile(r"^(.*?)[ _]*(?:\[([^\]]*)\]|\(([^)]*)\)|_(nT|uT|mT|T|ms|us|s|m|deg))?$")
+_UNIT_OF_NAME = re.compile(r"^(.*?)[ _]*(?:\[([^\]]*)\]|\(([^)]*)\)|_(nT|uT|µT|mT|T|ms|us|s|m|deg))?$")
+_FIELD_UNITS = ("nT", "uT", "µT", "mT")  # T and G also stand for a temperature and for gravity
+_UNIT_OF_CLOCK = {"millis": "ms", "micros": "us"}  # the clocks of an Arduino
 
 
 @dataclass(frozen=True)
@@ -207,7 +210,8 @@ def _find(header: Sequence[str], kind: str) -> str | None:
 
 def _unit(name: str) -> str:
     found = _UNIT_OF_NAME.match(name)
-    return next(filter(None, found.groups()[1:]), "") if found else ""
+    stated = next(filter(None, found.groups()[1:]), "") if found else ""
+    return stated or _UNIT_OF_CLOCK.get(name.lower(), "")
 
 
 def _propose_time(
@@ -268,7 +272,7 @@ def _propose_places(
         elif place.size and np.abs(place).max() > 1e4:
             asked.append('which grid are these places of? crs = "EPSG:32633" for UTM zone 33 north; and an origin')
         return
-    asked.append("no columns of a place were found: position or geodetic")
+    asked.append("no columns of a place were found: position or geodetic, if the array moves")
 
 
 def _propose_attitude(header: Sequence[str], keys: dict[str, object], asked: list[str], sensors: int) -> None:
@@ -285,7 +289,7 @@ def _propose_attitude(header: Sequence[str], keys: dict[str, object], asked: lis
 def _sensors(
     header: Sequence[str], values: dict[str, FloatArray], keys: dict[str, object], asked: list[str]
 ) -> dict[str, str | tuple[str, ...]]:
-    """Return columns with the modulus of the Earth's field, and their stated or likely unit."""
+    """Return columns with the modulus of the Earth's field, or whose names state the unit of a field."""
     taken: list[object] = []
     for key in ("time", "position", "geodetic"):
         named = keys.get(key, ())
@@ -310,10 +314,26 @@ def _sensors(
             if _EARTH_nT[0] < modulus * NANOTESLA[unit] < _EARTH_nT[1]:
                 units[group] = unit
                 break
+    stated_triples: dict[tuple[str, ...], str] = {
+        group: unit
+        for group in groups
+        if len(group) == 3
+        and (unit := _unit(group[0])) in _FIELD_UNITS
+        and 0.0 < _modulus(values, group) * NANOTESLA[unit] < _LARGEST_nT
+    }
+    alike = {_digits_hidden(group[0]) for group in units}
+    if not units and stated_triples:
+        units = stated_triples
+        asked.append("is the unit right? Readings differ from the Earth's field, as of Hall sensors with offsets")
+    elif units:  # one of several sensors with offsets may read like the Earth's field by chance
+        units |= {group: of for group, of in stated_triples.items() if _digits_hidden(group[0]) in alike}
+        units = {group: units[group] for group in groups if group in units}
     if not units:
         near = [name for name in free if _EARTH_nT[0] < _modulus(values, (name,)) < _EARTH_nT[1]]
         hint = f" (in nT it could be {' or '.join(near)})" if near else ""
-        asked.append(f"no column reads like the Earth's field: name those of the sensors{hint}")
+        asked.append(
+            f'no column reads like the Earth\'s field: name those of the sensors as s1 = ["bx", "by", "bz"]{hint}'
+        )
         return {}
     unit = next(iter(units.values()))
     if any(not _unit(group[0]) for group in units):
@@ -322,6 +342,10 @@ def _sensors(
         keys["unit"] = unit
     same = [group for group, of in units.items() if of == unit]
     return {f"s{k}": group[0] if len(group) == 1 else group for k, group in enumerate(same, start=1)}
+
+
+def _digits_hidden(name: str) -> str:
+    return re.sub(r"\d+", "#", name)
 
 
 def _modulus(values: dict[str, FloatArray], group: Sequence[str]) -> float:

@@ -23,6 +23,8 @@ _LOG = logging.getLogger(__name__)
 _OUTLIER = 5.0
 _MAD_TO_SIGMA = 1.4826
 _TOO_NOISY = 3.0
+_MORE_NOISE = 1.2  # times the stated one
+_MAD_EFFICIENCY = 0.37  # of a standard deviation by the median absolute deviation, beside the rms
 # Twenty times the Earth's field: no array at rest scatters so much.
 _LARGEST_SCATTER_T = 1e-3
 
@@ -61,7 +63,8 @@ class RestBackground:
         known = np.isfinite(values)
         with np.errstate(invalid="ignore", divide="ignore"):
             middle = _column_medians(values)
-            scatter = np.maximum(stated, _MAD_TO_SIGMA * np.nan_to_num(_column_medians(np.abs(values - middle))))
+            seen = _MAD_TO_SIGMA * np.nan_to_num(_column_medians(np.abs(values - middle)))
+            scatter = np.maximum(stated, seen)
             used = known & (np.abs(values - middle) <= _OUTLIER * scatter)
             count = used.sum(axis=0)
             mean = np.where(used, values, 0.0).sum(axis=0) / count
@@ -75,11 +78,18 @@ class RestBackground:
             )
         noisy = scatter > _TOO_NOISY * stated
         unsteady = tuple(name for i, name in enumerate(array.ids) if noisy[array.channel_sensor == i].any())
+        ratio = float(np.sqrt(np.mean((seen / stated)[known.any(axis=0)] ** 2))) if known.any() else 1.0
+        ratio_sigma = 1.0 / math.sqrt(2.0 * _MAD_EFFICIENCY * max(1, int(known.sum())))
         _LOG.info(f"the background is taken from {len(rows)} rows")
         if unsteady:
             _LOG.warning(
                 f"the readings of {', '.join(unsteady)} changed by more than three times their noise during the rest,"
                 " expected an array that does not move; take the rest again."
+            )
+        elif ratio > max(_MORE_NOISE, 1.0 + 5.0 * ratio_sigma):
+            _LOG.warning(
+                f"the readings scatter during the rest by {ratio:.2g} times their noise, expected once; multiply"
+                f" noise_nT of the array file by {ratio:.2g}."
             )
         return cls(mean - array.channel_offset_T, sigma, len(rows), unsteady)
 

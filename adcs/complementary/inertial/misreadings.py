@@ -155,8 +155,8 @@ def _sentence(named: list[str], seen: str, before: FloatArray, after: FloatArray
     return (
         f"Input {argument} must turn as the other sensors do; instead received readings that agree if this is undone: "
         f"{', or '.join(named[:3])}. The turns of gyro and {seen} differ by {as_read} as read and by {undone} without "
-        f"it (median of {len(before)} windows). Convert it, or state unit, order of the columns and mounting in the "
-        "layout of the log."
+        f"it (median of {len(before)} windows). Convert it, or state unit, time_format, order of the columns and "
+        "mounting in the layout of the log."
     )
 
 

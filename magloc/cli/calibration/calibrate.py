@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 # Standard deviations of the prior beyond which a gain is reported.
 _STRANGE = 4.0
+_TURNED = 3.0  # χ²/dof: 1.7 times the stated noise
 _ALIKE = 0.1  # largest difference of gains that have one cause
 
 
@@ -148,6 +149,8 @@ def calibrate(
     else:
         _check_converged(result, readings, out)
         report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
+        if moment is None and (path is None or (path.moment_Am2 is None and path.axis is None)):
+            notes += _turn_notes(result)
         report["cross_validation"] = None
         if validation is not None:
             background = None if used is nominal else "subtracted"
@@ -319,6 +322,17 @@ def _table(result: SourceCalibration) -> list[str]:
         ]
         rows.append([sensor, *cells, f"{1e9 * rms:.1f}", ""])
     return align(rows, left=1)
+
+
+def _turn_notes(result: SourceCalibration) -> list[str]:
+    """Return a warning if the readings contradict the moment that is taken for constant."""
+    excess = result.chi2 / max(1.0, result.dof)
+    if excess < _TURNED:
+        return []
+    return [
+        f"warning: χ² is {excess:.2g} times its degrees of freedom, expected about 1, with a moment that is constant;"
+        " do not use this calibration. If the source turned, take --moment free, or a --truth with its moments"
+    ]
 
 
 def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> list[str]:

@@ -86,7 +86,10 @@ class TestHonesty:
     @pytest.mark.slow
     @pytest.mark.parametrize("offline", [False, True])
     def test_magnets_that_are_hardly_noticed(self, data_folder: Path, offline: bool) -> None:
-        """4 to 13 µT from 45 to 100 s. The rule's window and limits were chosen by looking at these runs; without the test of changes NEES is above 4."""
+        """4 to 13 µT from 45 to 100 s; without the test of changes NEES is above 4.
+
+        The rule's window and limits were chosen by looking at these runs.
+        """
         nees = []
         for name in BROAD[:4]:
             log = read_imu(path_of(data_folder, name))

@@ -88,6 +88,20 @@ class TestRead:
         assert log.record.gyro_samples == "point"
         assert log.moving.sum() == (IMU.time_s > 8.0).sum()
 
+    @pytest.mark.parametrize(("time_format", "per_s"), [("milliseconds", 1e3), ("microseconds", 1e6)])
+    def test_other_units_of_time(self, time_format, per_s, own):
+        names = ["p", "q", "r", "ax", "ay", "az", "bx", "by", "bz", "a", "b", "c", "d", "m"]
+        rates = np.column_stack([np.degrees(IMU.gyro_rad_s), IMU.acceleration_m_s2 / -9.80665, 1e6 * IMU.field_T])
+        values = np.column_stack([rates, IMU.truth.as_quat(), np.ones(len(rates))])
+        write_columns({"stamp": per_s * IMU.time_s, **dict(zip(names, values.T, strict=True))}, own / "own.csv")
+        (own / "own.toml").write_text(OWN.replace('"unix"', f'"{time_format}"'))
+        np.testing.assert_allclose(read_imu(own / "own.csv", own / "own.toml").record.time_s, IMU.time_s, atol=1e-9)
+
+    def test_other_names_without_a_layout(self, tmp_path):
+        write_columns({"time_s": IMU.time_s, "p": IMU.time_s}, tmp_path / "log.csv")
+        with pytest.raises(InputError, match=r"found no such column.*; a layout \(--config\) names other columns"):
+            read_imu(tmp_path / "log.csv")
+
     def test_degrees_without_a_layout(self, tmp_path):
         names = [f"{kind}_{axis}_{unit}" for kind, unit in KINDS for axis in "xyz"]
         values = np.column_stack([np.degrees(IMU.gyro_rad_s), IMU.acceleration_m_s2, 1e9 * IMU.field_T])

@@ -71,6 +71,19 @@ class TestProposal:
         assert (found.keys["names"], found.sensors, found.header_line) == (("c1", "c2", "c3", "c4"), {"s1": "c4"}, 2)
         assert any("no header" in question for question in found.asked)
 
+    @pytest.mark.parametrize("first", [200.0, 48.0])
+    @pytest.mark.parametrize("unit", ["[uT]", "(µT)", "_µT"])
+    def test_hall_sensors_with_offsets(self, first: float, unit: str, tmp_path: Path) -> None:
+        """All triples with the unit of a field are sensors, also where one reads like the Earth's field."""
+        triples = {f"s{k}": tuple(f"H{k}_B{c}{unit}" for c in "xyz") for k in (1, 2, 3)}
+        head = ",".join(["millis", *(name for triple in triples.values() for name in triple), "ax_g,ay_g,az_g"])
+        path = written(tmp_path, head, f"{{ms}},0,0,{first},900,-31,-1200,0,0,1e5,0,0,1")
+        found = propose_columns(path)
+        assert found.sensors == triples
+        assert (found.keys["time"], found.keys["time_unit"]) == ("millis", "ms")
+        assert found.keys["unit"] in ("uT", "µT")
+        assert any("offsets" in question for question in found.asked) == (first == 200.0)
+
     def test_vectors_and_their_unit(self, tmp_path: Path) -> None:
         path = written(tmp_path, "time_s,B1x [uT],B1y [uT],B1z [uT],Temp", "{0:.1f},{1},{2},40,31")
         found = propose_columns(path)

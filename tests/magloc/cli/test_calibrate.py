@@ -17,7 +17,7 @@ from arrays.array import SensorArray
 from arrays.array_file import read_array, read_sensors, write_array
 from arrays.sensor import Calibration, Sensor
 from magloc.calibration import calibrate as calibration
-from magloc.readings import Readings, write_readings
+from magloc.readings import Readings, read_readings, write_readings
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant
 from tests.oracles import magpylib_field
 
@@ -169,6 +169,18 @@ class TestArrayFile:
         written = read_array(files.out)
         assert [s.position_m for s in written.sensors[:3]] == [s.position_m for s in files.true.sensors[:3]]
         assert written.sensors[3].calibration.scale == files.true.sensors[3].calibration.scale
+
+    def test_a_source_that_turned(self, run: Run, tmp_path: Path) -> None:
+        """With poses the readings are of one moment in the world; without them it turns in every row."""
+        posed = made(tmp_path, posed=True)
+        nominal = read_array(posed.array)
+        write_readings(posed.readings, Readings(read_readings(posed.readings, nominal).values_T), nominal)
+        truth = replace(posed, origin_m=0.0 * posed.origin_m, world_from_array=np.broadcast_to(np.eye(3), (40, 3, 3)))
+        words = "If the source turned, take --moment free"
+        assert words in calibrated(run, posed, truth=truth.truth()).err
+        free = calibrated(run, posed, "--moment", "free", truth=truth.truth())
+        assert words not in free.err
+        assert_recovered(posed, but_gain=True)
 
     def test_rows_are_matched_by_time(self, run: Run, files: Files) -> None:
         """Rows without truth are left out, in whatever order the truth is."""

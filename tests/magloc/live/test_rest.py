@@ -46,6 +46,18 @@ class TestBackground:
             found.mean_T, RestBackground.from_rows(ARRAY, rows_at_rest(1)).mean_T - array.channel_offset_T
         )
 
+    @pytest.mark.parametrize(("factor", "warned"), [(1.0, 0), (1.5, 100)])
+    def test_a_noise_that_is_stated_too_small(
+        self, factor: float, warned: int, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """The ratio is printed; five standard deviations of 480 readings: a right noise warns once in a million."""
+        stated = replace(ARRAY, sensors=tuple(replace(s, noise_T=s.noise_T / factor) for s in ARRAY.sensors))
+        for seed in range(100):
+            RestBackground.from_rows(stated, rows_at_rest(seed))
+        ratios = [float(r.getMessage().split(" times")[0].split()[-1]) for r in caplog.records if "multiply" in r.msg]
+        assert len(ratios) == warned
+        assert np.allclose(ratios, factor, rtol=0.27)
+
     def test_spikes_do_not_count(self) -> None:
         rows = rows_at_rest(2)
         spiked = list(rows)
