@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -183,13 +183,14 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
                 f"Input telemetry must have readings of the {SENSOR_WORDS[name]} for the sensors {used.sensors}; "
                 "instead received none."
             )
-    check_conventions(telemetry, record, used.sensors.split("+"))
+    warnings = check_conventions(telemetry, record, used.sensors.split("+"))
     first = first_observed_row(record, used, with_gyro=chosen.filter == "reduced")
     record = part(record, np.array([0]), slice(first, None))
     tracks = estimate_tracks(record, chosen, any_start)
     if not (np.isfinite(tracks.q).all() and tracks.definite.all()):
         raise ValueError("Input telemetry must have readings that an attitude explains; instead the filter has failed.")
-    return _track(telemetry, first, record, chosen, tracks)
+    track = _track(telemetry, first, record, chosen, tracks)
+    return replace(track, warnings=(*warnings, *track.warnings))
 
 
 def _track(

@@ -94,6 +94,28 @@ class TestLeftAlone:
         log, satellite = flight
         adcs.estimate(changed(log, **values(log)), satellite, sensors=SENSORS, states=["gyro-bias"])
 
+    @pytest.mark.parametrize(("local_time_h", "latitude_deg"), [(15.0, 90.0), (3.0, 180.0)])
+    def test_a_wrong_orbit_is_no_misread_axis(self, flight, local_time_h, latitude_deg):
+        """Axes keep the modulus, so that a modulus off by over 15 % must put the orbit before the axes."""
+        log, satellite = flight
+        orbit = adcs.circular_orbit(
+            altitude_m=600e3,
+            inclination_deg=20.0,
+            local_time_h=local_time_h,
+            latitude_argument_deg=latitude_deg,
+            epoch=satellite.start,
+        )
+        with pytest.raises(ValueError, match="Check the start, altitude"):
+            adcs.estimate(log, replace(satellite, orbit=orbit), sensors="mag+sun+gyro", states=["gyro-bias"])
+
+    def test_a_wrong_orbit_that_no_axis_explains_is_a_warning(self, flight):
+        log, satellite = flight
+        orbit = adcs.circular_orbit(altitude_m=1500e3, inclination_deg=97.8, local_time_h=15.0, epoch=satellite.start)
+        wrong = adcs.estimate(log, replace(satellite, orbit=orbit), sensors="mag+gyro")
+        right = adcs.estimate(log, satellite, sensors="mag+gyro")
+        assert "check the start, altitude" in " ".join(wrong.warnings)
+        assert "check the start, altitude" not in " ".join(right.warnings)
+
     def test_a_sensor_that_is_not_used(self, flight):
         log, satellite = flight
         adcs.estimate(changed(log, field_T=1e-3 * log.field_T), satellite, sensors="st+gyro")
