@@ -149,9 +149,11 @@ def _heights_of_band(path: str, file: Any, low: FloatArray, high: FloatArray, or
     """Return the heights of the first band of an open raster, near a rectangle."""
     import rasterio
 
-    if file.units[0] not in _METRES:
-        raise InputError(f"{path}: found heights in {file.units[0]!r}, expected metres.")
     system = None if file.crs is None else coordinate_system(file.crs.to_wkt())
+    of_system = [] if system is None else [axis.unit_name for axis in system.axis_info if axis.direction == "up"]
+    for unit in (file.units[0], *of_system):
+        if unit not in _METRES:
+            raise InputError(f"{path}: found heights in {unit!r}, expected metres.")
     if (system is None) != (origin is None):
         found = "coordinates without a system" if system is None else f"coordinates of {system.name}"
         log = "known on the Earth" if system is None else "in a frame without a place on the Earth"

@@ -101,6 +101,14 @@ class TestRaster:
         with pytest.raises(arrays.InputError, match="expected terrain that covers"):
             magloc.read_terrain(tmp_path / "dem.tif", LINES, origin=ORIGIN)
 
+    def test_heights_in_feet_by_the_coordinate_system(self, tmp_path: Path) -> None:
+        rasterio = pytest.importorskip("rasterio")
+        write_raster(tmp_path / "dem.tif", "EPSG:25833")
+        with rasterio.open(tmp_path / "dem.tif", "r+") as file:
+            file.crs = "EPSG:25833+6360"
+        with pytest.raises(arrays.InputError, match="found heights in 'US survey foot', expected metres"):
+            magloc.read_terrain(tmp_path / "dem.tif", LINES, origin=ORIGIN)
+
     def test_other_faults(self, tmp_path: Path) -> None:
         rasterio = pytest.importorskip("rasterio")
         write_raster(tmp_path / "dem.tif", "EPSG:25833")
