@@ -5,6 +5,7 @@ Blocks of successive rows are left out, because neighbouring rows are nearly one
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -38,6 +39,14 @@ class CrossValidation:
     """
 
     error_m: FloatArray
+
+    @property
+    def mean_m(self) -> float:
+        """Mean error of all rows, where a row without a fix counts as the worst of the others; infinite without any."""
+        solved = np.isfinite(self.error_m)
+        if not solved.any():
+            return math.inf
+        return float(np.where(solved, self.error_m, self.error_m[solved].max()).mean())
 
     @property
     def json(self) -> dict[str, Any]:
@@ -105,6 +114,5 @@ def choose_common_field(
         return array, plain
     stated = replace(array, common_field_T=BACKGROUND_CHANGE_T)
     other = leave_poses_out(stated, readings, truth, moment=moment, prior=prior)
-    if other is None or not np.nanmean(other.error_m) < _BETTER * np.nanmean(plain.error_m):
-        return array, plain
-    return stated, other
+    is_better = other is not None and other.mean_m < _BETTER * plain.mean_m
+    return (stated, other) if is_better else (array, plain)

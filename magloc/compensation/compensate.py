@@ -12,7 +12,7 @@ from arrays.array import SensorArray
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray
 from magloc.compensation.attitude import Attitude, ambient_at, attitude_effects, currents_at, platform_moduli
-from magloc.compensation.doubts import correction_doubts, fit_doubts, log_doubts
+from magloc.compensation.doubts import correction_doubts, fit_doubts, log_doubts, mismatch_doubts
 from magloc.compensation.fit import PlatformFit, fit_platform
 from magloc.compensation.log import PlatformLog, columns_of
 from magloc.compensation.results import Compensation, SensorCompensation
@@ -88,6 +88,7 @@ def compensate(
     values, sigma = _corrected(log, fits)
     for of in sensors:
         flags += correction_doubts(of, sigma[:, array.ids.index(of.sensor)])
+        flags += mismatch_doubts(of.sensor, log, values)
     return Compensation(array, sensors, readings.time_s, values, sigma, tuple(flags))
 
 

@@ -8,10 +8,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from arrays.typing import FloatArray
-from magloc.compensation.figure_of_merit import HEADINGS
-from magloc.compensation.fit import Background, PlatformFit
+from magloc.compensation.figure_of_merit import BAND_S, HEADINGS
+from magloc.compensation.fit import FEWEST_ROWS, Background, PlatformFit
 from magloc.compensation.log import PlatformLog
 from magloc.compensation.results import SensorCompensation
+from magloc.compensation.signals import band_passed
+from magloc.measurement.plausibility import EARTH_T
+from magloc.surveying.preparation import field_moduli
 
 _LATE_SIGMAS, _LATE_S = 4.0, 0.02
 _TURNED_DEG = 5.0
@@ -19,7 +22,7 @@ _FALSE_ALARM = 1e-4
 _CANDIDATES = 40
 _NOISE_RATIO = 5.0
 _UNSURE_T = 1e-10
-_EARTH_T = (15e-6, 80e-6)
+_SLOPE_WITHIN, _SLOPE_SIGMAS = 0.2, 4.0  # of a log beside its correction
 
 
 def log_doubts(log: PlatformLog) -> Iterator[str]:
@@ -32,7 +35,7 @@ def log_doubts(log: PlatformLog) -> Iterator[str]:
             )
     for name, signal in log.signals.items():
         modulus = float(np.median(np.linalg.norm(signal.samples()[1], axis=1))) if signal.stretches else np.nan
-        if not _EARTH_T[0] < modulus < _EARTH_T[1]:
+        if not EARTH_T[0] < modulus < EARTH_T[1]:
             yield f"unit: sensor {name} reads {1e9 * modulus:.4g} nT, expected the Earth's field of 20,000 to 70,000 nT"
     for name, (stuck, wild) in log.left_out.items():
         for count, what in ((stuck, "stuck"), (wild, "wild")):
@@ -96,6 +99,32 @@ def correction_doubts(of: SensorCompensation, sigma_T: FloatArray) -> Iterator[s
         yield (
             f"attitude: the correction of {of.sensor} is uncertain by {1e9 * unsure:.2g} nT at attitudes of the log"
             " that the calibration does not show"
+        )
+
+
+def mismatch_doubts(sensor: str, log: PlatformLog, corrected_T: FloatArray) -> Iterator[str]:
+    """Yield a doubt if the fast changes of a log (n, C) do not follow those of its correction.
+
+    Their slope is 1 for the right correction, and below a half it adds more than it removes. Anomalies of the ground
+    are independent of it.
+    """
+    which = log.array.ids.index(sensor)
+    read, after = (field_moduli(log.array, values)[:, which] for values in (log.readings.values_T, corrected_T))
+    known = np.isfinite(read) & np.isfinite(after)
+    if known.sum() < FEWEST_ROWS:
+        return
+    time_s = log.readings.time_s[known]
+    fast = band_passed(time_s, np.stack([read, read - after], axis=1)[known], BAND_S)
+    size = float(np.sum(fast[:, 1] ** 2))
+    if not size:
+        return
+    slope = float(fast[:, 0] @ fast[:, 1]) / size
+    independent = max(float(np.ptp(time_s)) / BAND_S, 1.0)
+    sigma = float(np.linalg.norm(fast[:, 0] - slope * fast[:, 1])) / np.sqrt(size * independent)
+    if abs(slope - 1.0) > _SLOPE_WITHIN + _SLOPE_SIGMAS * sigma:
+        yield (
+            f"mismatch: fast changes of {sensor} in the log are {slope:.2g} ± {sigma:.1g} times those of its"
+            " correction, expected 1: is the calibration of another platform, or are the axes others?"
         )
 
 

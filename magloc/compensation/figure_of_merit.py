@@ -20,7 +20,8 @@ from magloc.compensation.signals import band_passed
 AXES = ("roll", "pitch", "yaw")
 """Turns about x, y and z of the array's frame."""
 HEADINGS = 4
-_WIDTH_S = 2.5  # of the Gaussian filter whose result is subtracted: periods above 20 s are no manoeuvres
+BAND_S = 2.5
+"""Width of the Gaussian filter whose result is subtracted: periods above 20 s are no manoeuvres."""
 _WINDOW_S = 5.0
 _LEAST_RAD = 0.008  # least standard deviation of the direction of the field in a manoeuvre
 _STEADY_RAD_S = 0.03  # largest rate of the direction beside manoeuvres; faster ones are turns between lines
@@ -47,7 +48,7 @@ class Manoeuvres:
         Rates (n, 3) of the array about its axes tell roll from yaw on headings along the field, where the direction
         alone does not.
         """
-        fast = band_passed(time_s, unit, _WIDTH_S)
+        fast = band_passed(time_s, unit, BAND_S)
         slow = unit - fast
         window = np.floor((time_s - time_s[0]) / _WINDOW_S).astype(np.intp)
         index = np.unique(window, return_inverse=True)[1]
@@ -62,7 +63,7 @@ class Manoeuvres:
         if turning is None:
             energy = np.stack([_explained(fast, slow, k, index) for k in range(3)], axis=1)
         else:
-            energy = mean(band_passed(time_s, turning, _WIDTH_S) ** 2)
+            energy = mean(band_passed(time_s, turning, BAND_S) ** 2)
         axis = np.argmax(energy, axis=1)
         cell = 3 * _headings(middle, (size > _LEAST_RAD) & steady) + axis
         cell[(size <= _LEAST_RAD) | ~steady] = -1
@@ -75,7 +76,7 @@ class Manoeuvres:
 
     def fast(self, values: FloatArray) -> FloatArray:
         """Return values (n, ...) in the band of the manoeuvres."""
-        return band_passed(self.time_s, values, _WIDTH_S)
+        return band_passed(self.time_s, values, BAND_S)
 
     def figure_T(self, values_T: FloatArray) -> float:
         """Return the figure of merit of readings (n,).

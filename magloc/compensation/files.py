@@ -48,6 +48,8 @@ class LogFile:
         """Read the log of an array, and some columns of currents."""
         form = log_format(array, None)
         for name in currents:
+            if currents.count(name) > 1:
+                raise InputError(f"Input currents: found {name} twice, expected every column once.")
             if name in form.others or name in {column for of in form.channels.values() for column in of}:
                 raise InputError(f"Input currents: found {name}, which is a column of the readings, expected others.")
         form = replace(form, others=(*form.others, *currents))

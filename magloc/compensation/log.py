@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -76,17 +77,14 @@ class PlatformLog:
                 moduli[sensor.id] = (values[:, channel] - array.channel_offset_T[channel]) / array.channel_gain[
                     channel, 0
                 ]
-        read = [each[np.isfinite(each) & (each > 0.0)] for each in moduli.values()]
-        usual = float(np.median(np.concatenate(read))) if any(map(len, read)) else np.nan
+        usual = _median(np.stack(list(moduli.values()))) if moduli else np.nan
         signals, factors = {}, {}
         for i, sensor in enumerate(array.sensors):
             if sensor.kind == "scalar":
                 signals[sensor.id] = Signal.of(readings.time_s, moduli[sensor.id][:, None])
                 continue
-            lengths = np.linalg.norm(fields[:, i], axis=1)
-            ratio = float(np.median(lengths[np.isfinite(lengths)])) / usual if np.isfinite(lengths).any() else np.nan
-            is_other = ratio > 0.0 and not 1.0 / _SAME_UNIT < ratio < _SAME_UNIT
-            factors[sensor.id] = ratio if is_other else 1.0
+            ratio = _median(np.linalg.norm(fields[:, i], axis=1)) / usual
+            factors[sensor.id] = 1.0 if np.isnan(ratio) or 1.0 / _SAME_UNIT < ratio < _SAME_UNIT else ratio
             signals[sensor.id] = Signal.of(readings.time_s, fields[:, i] / factors[sensor.id])
         flowing = None if not currents.shape[1] else Signal.of(readings.time_s, currents)
         jumps = np.nan_to_num(currents - currents_at(flowing, readings.time_s))
@@ -166,6 +164,12 @@ class PlatformLog:
         )
 
 
+def _median(values: FloatArray) -> float:
+    """Return the median of what is known; NaN if nothing is."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else math.nan
+
+
 def columns_of(currents: Mapping[str, ArrayLike] | None, names: tuple[str, ...], n: int) -> FloatArray:
     """Return currents (n, K) of some names; refuse others, and columns of another length."""
     given = {} if currents is None else dict(currents)
@@ -175,6 +179,8 @@ def columns_of(currents: Mapping[str, ArrayLike] | None, names: tuple[str, ...],
     for name, column in zip(names, columns, strict=True):
         if column.shape != (n,):
             raise ValueError(f"Input currents must have shape ({n},); instead received {column.shape} for {name}.")
+        if not np.isfinite(column).any():
+            raise ValueError(f"Input currents must have a reading of each current; instead received none of {name}.")
     return np.stack(columns, axis=1) if names else np.zeros((n, 0))
 
 

@@ -19,6 +19,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
 from magloc.grids.work import workers
 from magloc.localization.fit.prior import NOTHING_KNOWN
+from magloc.measurement.plausibility import EARTH_T
 from magloc.measurement.rows import check_magnitudes, concatenate_readings
 from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
@@ -110,6 +111,8 @@ class Quality(Result):
         Delay of the readings after their poses; 0 if the targets show none. None without targets or an ambient field.
     coverage : Coverage, optional
         None for a single line.
+    field_T : ndarray, shape (N,)
+        Median modulus of each sensor; NaN without any.
     held : float
         Share of rows whose place stands still between fixes of the receiver.
 
@@ -143,6 +146,7 @@ class Quality(Result):
     heading: list[HeadingError | None]
     lag: ClockLag | None
     coverage: Coverage | None
+    field_T: FloatArray
     held: float
 
     @property
@@ -207,7 +211,8 @@ class Quality(Result):
 
         speeds = [line.speed_m_s for line in self.lines_flown] or [0.0]
         yield check("lines", len(self.lines_flown), "")
-        yield check("length", float(np.linalg.norm(np.diff(self.place_m[:, :2], axis=0), axis=1).sum()), "m")
+        length_m = float(np.linalg.norm(np.diff(self.place_m[:, :2], axis=0), axis=1).sum())
+        yield check("length", length_m, "m", "" if length_m else "the place does not change")
         for name, values, unit in (("speed", np.array(speeds), "m/s"), ("height", self.height_m, "m")):
             yield check(name, float(np.mean(values)), unit)
             yield check(f"least {name}", float(np.min(values)), unit)
@@ -221,6 +226,11 @@ class Quality(Result):
 
     def _sensors(self) -> Iterator[Check]:
         for i, sensor in enumerate(self.array.sensors):
+            field_T = float(self.field_T[i])
+            if math.isfinite(field_T):
+                is_whole = self.array.common_field_T is None
+                remark = "" if not is_whole or EARTH_T[0] < field_T < EARTH_T[1] else "not the Earth's field: is it nT?"
+                yield Check("field", sensor.id, 1e9 * field_T, "nT", remark)
             stated_T = float(self.array.channel_noise_T[self.array.channel_sensor == i].max())
             noise_T = float(self.noise_T[i])
             remark = f"{noise_T / stated_T:.1f} times the stated noise" if noise_T > _NOISY * stated_T else ""
@@ -342,6 +352,7 @@ def check_quality(
         [heading_error(place_m[:, :2], column, lines) for column in _without_ambient(rows, moduli_T).T],
         _clock_lag(array, rows[np.flatnonzero(~unusable.any(axis=1))], ground, coverage),
         coverage,
+        np.array([float(np.median(known)) if (known := m[np.isfinite(m)]).size else math.nan for m in moduli_T.T]),
         held,
     )
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
+EARTH_T = (15e-6, 80e-6)
+"""Smallest and largest modulus of the Earth's field, with a margin for a platform."""
 FEWEST_ROWS = 20
 """Least number of rows for a check of a record."""
 _OF_A_NANOTESLA = {"µT": 1e-3, "G": 1e-5, "T": 1e-9}

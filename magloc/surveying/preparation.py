@@ -146,7 +146,7 @@ def _jitter_m(array: SensorArray, readings: Readings) -> float:
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
-    """Return rows and sensors (n, N) in long runs of one reading while others change."""
+    """Return rows and sensors (n, N) in long runs of one reading while others change, or in the whole log."""
     n = len(values)
     lengths = np.empty((n, array.n_sensors))
     for i in range(array.n_sensors):
@@ -155,7 +155,8 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
         run = np.cumsum(begins) - 1
         lengths[:, i] = np.bincount(run)[run]
     typical = [len(column) / np.sum(1.0 / column) for column in lengths.T]  # mean length of a run
-    return np.asarray(lengths > max(_LONGEST_RUN, _LONGEST_RUN * min(typical, default=math.inf)))
+    least = min(typical, default=math.inf)
+    return np.asarray(lengths > _LONGEST_RUN * (1.0 if least >= n else least))  # a log of one reading shows no field
 
 
 def leaping_rows(readings: Readings) -> BoolArray:

@@ -18,7 +18,7 @@ from arrays.io.world_maps import place_in_words
 from arrays.logs.format import LogFormat
 from arrays.logs.systems import coordinate_system, transform_points
 from arrays.typing import FloatArray, Vector
-from magloc.readings import EXPECTED_HEADER, Readings
+from magloc.readings import EXPECTED_HEADER, Readings, log_format
 from magloc.terrain.surface import Terrain, interpolate_nodes, interpolate_points, point_spacing
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ _MARGIN_M = 20.0  # around the lines
 _WIDE = 4.0  # further margin for points, in their spacings
 _MOST_CHECKED = 20_000  # rows that must lie above the terrain
 _ALTIMETER_CELL_M = 0.5  # readings of an altimeter in one cell become their median
+_NO_DATA_M = 9999.0  # larger numbers stand for unknown heights, such as -9999 and -32768
 _METRES = {None, "", "m", "metre", "meter", "metres", "meters"}
 _AXES = {
     "local": ({"x", "x_m"}, {"y", "y_m"}),
@@ -100,6 +101,7 @@ def _heights_of_table(path: str, low: FloatArray, high: FloatArray, origin: Vect
         found = f"{names[0]} and {names[1]} for lines in a frame without a place on the Earth"
         raise InputError(f"{path}: found {found}, expected x, y, height.")
     points = table.complete(names)
+    points = points[np.abs(points[:, 2]) < _NO_DATA_M]
     system = None if kind == "local" else coordinate_system(_WGS84 if kind == "geographic" or crs is None else crs)
     on_map = _to_system(system, origin)
     near = on_map(_rectangle(low, high))
@@ -147,9 +149,11 @@ def _heights_of_band(path: str, file: Any, low: FloatArray, high: FloatArray, or
     """Return the heights of the first band of an open raster, near a rectangle."""
     import rasterio
 
-    if file.units[0] not in _METRES:
-        raise InputError(f"{path}: found heights in {file.units[0]!r}, expected metres.")
     system = None if file.crs is None else coordinate_system(file.crs.to_wkt())
+    of_system = [] if system is None else [axis.unit_name for axis in system.axis_info if axis.direction == "up"]
+    for unit in (file.units[0], *of_system):
+        if unit not in _METRES:
+            raise InputError(f"{path}: found heights in {unit!r}, expected metres.")
     if (system is None) != (origin is None):
         found = "coordinates without a system" if system is None else f"coordinates of {system.name}"
         log = "known on the Earth" if system is None else "in a frame without a place on the Earth"
@@ -162,7 +166,8 @@ def _heights_of_band(path: str, file: Any, low: FloatArray, high: FloatArray, or
     if min(n_columns, n_rows) < 1:
         _refuse_uncovered(path, lambda xy: np.full(len(xy), np.nan), 0.5 * (low + high)[None], origin)
     band = file.read(1, window=rasterio.windows.Window(column, row, n_columns, n_rows), masked=True)
-    of_nodes = interpolate_nodes(band.astype(np.float64).filled(np.nan) * file.scales[0] + file.offsets[0])
+    height_m = band.astype(np.float64).filled(np.nan) * file.scales[0] + file.offsets[0]
+    of_nodes = interpolate_nodes(np.where(np.abs(height_m) < _NO_DATA_M, height_m, np.nan))
     to_pixel = ~file.transform
 
     def heights(xy_m: FloatArray) -> FloatArray:
@@ -239,6 +244,12 @@ def read_altitudes(path: str | PathLike[str], array: SensorArray, column: str, t
     Missing values, and values that are not positive, are interpolated.
     """
     columns = array.columns
+    form = log_format(array, None)
+    of_readings = {name for of in form.channels.values() for name in of}
+    if columns is not None:
+        of_readings |= set(columns.of_sensors(form.channels).values())
+    if column in {"time_s", *form.others, *of_readings}:
+        raise InputError(f"{path}, column {column}: found times, poses or readings, expected heights above ground.")
     form = LogFormat({}, columns, EXPECTED_HEADER, (column,))
     table = form.table(read_text(path, "a CSV file", form.encoding), str(path))
     table.require(column, ())

@@ -20,6 +20,7 @@ from adcs.satellite.conventions import FIELD_UNITS, RATE_UNITS, angle, median, r
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import instants_within, steps_s
 from arrays.typing import BoolArray, FloatArray
+from magloc.measurement.plausibility import EARTH_T
 
 _GRAVITY_M_S2 = 9.81
 _LEAST_GRAVITY_M_S2 = 5.0  # least median of all readings for any motion of the unit
@@ -29,7 +30,6 @@ _ACCELERATION_UNITS = {
     "m/s² taken for g": 1.0 / 9.80665,
     "m/s² taken for mg": 1e3 / 9.80665,
 }
-_EARTH_T = (15e-6, 80e-6)
 _PLAUSIBLE_T = (5e-6, 500e-6)
 _MORE_RATE_UNITS = {
     "mrad/s taken for rad/s": 1e-3,
@@ -92,7 +92,7 @@ def check_lengths(acceleration_m_s2: FloatArray, field_T: FloatArray, starting: 
         )
     if np.isfinite(field_T).any() and not (_PLAUSIBLE_T[0] < field[0] < _PLAUSIBLE_T[1]):
         for name, factor in FIELD_UNITS.items():
-            if ((_EARTH_T[0] < factor * field) & (factor * field < _EARTH_T[1])).all():
+            if ((EARTH_T[0] < factor * field) & (factor * field < EARTH_T[1])).all():
                 raise ValueError(
                     "Input field_T must be near the Earth's field, 22 to 67 µT; instead received "
                     f"{1e6 * field[0]:.3g} µT at the start, which is the magnetometer in {name}. Convert it, or state "

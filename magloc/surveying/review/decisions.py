@@ -32,6 +32,12 @@ class _Decision(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, f
     when: str = ""
     numbers: dict[str, Any] = {}
 
+    def __post_init__(self) -> None:
+        place_m = self.numbers.get("position_m", [0.0, 0.0, 0.0])
+        if not (isinstance(place_m, list) and all(isinstance(x, int | float) for x in place_m)):
+            raise ValueError(f"Input position_m must have 3 finite numbers; instead received {place_m}")
+        _check_places([place_m], (3,))
+
 
 class Drop(_Decision, frozen=True, tag_field="action", tag="drop"):
     """Drop a target."""
@@ -46,6 +52,7 @@ class Split(_Decision, frozen=True, tag_field="action", tag="split"):
     places_m: list[list[float]] = []
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if len(self.places_m) not in (0, 2):
             raise ValueError(f"Input places_m must have two places or none; instead received {len(self.places_m)}")
         _check_places(self.places_m, (2, 3))
@@ -57,6 +64,7 @@ class Add(_Decision, frozen=True, tag_field="action", tag="add"):
     place_m: list[float]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_places([self.place_m], (2, 3))
 
 
@@ -68,6 +76,7 @@ class Exclude(_Decision, frozen=True, tag_field="action", tag="exclude"):
     to_s: float | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _check_places(self.polygon_m, (2,))
         is_stretch = self.from_s is not None and self.to_s is not None and self.from_s <= self.to_s
         if (len(self.polygon_m) >= _FEWEST_CORNERS) == is_stretch:

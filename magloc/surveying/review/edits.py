@@ -89,7 +89,7 @@ def split(edit: SurveyEdit, target: str, places_m: Sequence[Sequence[float]], na
 
 
 def check_place(tiled: TiledSurvey, place_m: Sequence[float]) -> None:
-    """Refuse a place (x, y) that is far from all rows on the map."""
+    """Refuse a place (x, y) that is far from all rows on the map, and a place (x, y, z) above the ground."""
     apart_m = np.linalg.norm(row_places(tiled)[:, :2] - place_m[:2], axis=1)
     reach_m = _OUTSIDE_M + tiled.nearest_m
     if apart_m.min() > reach_m:
@@ -97,6 +97,9 @@ def check_place(tiled: TiledSurvey, place_m: Sequence[float]) -> None:
             f"Input place must be within {reach_m:.2g} m of a row on the map; instead received"
             f" ({place_m[0]:g}, {place_m[1]:g}), {apart_m.min():.3g} m from the nearest row."
         )
+    terrain = tiled.ground.terrain
+    if len(place_m) > 2 and (above_m := -float(terrain.depth_of(np.array(place_m)))) > 0.0:
+        raise ValueError(f"Input place must be below the ground; instead received one {above_m:.3g} m above it.")
 
 
 def _piece_at(tiled: TiledSurvey, place_m: Sequence[float]) -> Piece:

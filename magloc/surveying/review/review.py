@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -222,7 +223,7 @@ class Review:
         if target is None:  # it is new and has no numbers before the next fit
             return {}
         then = decision.numbers.get("position_m")
-        if then is not None and (apart_m := float(np.linalg.norm(target.position_m - then))) > _SAME_TARGET_M:
+        if then is not None and (apart_m := math.dist(target.position_m, then)) > _SAME_TARGET_M:
             raise ValueError(
                 f"Input target {target.id} must be where the decision says; instead received one {apart_m:.3g} m away:"
                 " the log is of another survey, or of other options."

@@ -299,6 +299,12 @@ class TestTracks:
         ):
             self.read(tmp_path, date="2026-03-25")
 
+    @pytest.mark.parametrize("places", ["x-ecef(m) y-ecef(m) z-ecef(m)", "e-baseline(m) n-baseline(m) u-baseline(m)"])
+    def test_other_coordinates_are_refused(self, places: str, tmp_path: Path) -> None:
+        (tmp_path / "walk.pos").write_text(f"%  UTC {places} Q ns\n2026/04/25 09:40:00.000 3.1 4.2 0.1 1 12\n")
+        with pytest.raises(arrays.InputError, match="expected one of RTKLIB and Emlid"):
+            arrays.read_track(tmp_path / "walk.pos")
+
     def test_another_file(self, tmp_path: Path) -> None:
         (tmp_path / "log.csv").write_text(MAGARROW, encoding="utf-8")
         with pytest.raises(arrays.InputError, match="expected one of RTKLIB and Emlid"):

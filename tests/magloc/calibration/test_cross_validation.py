@@ -12,7 +12,7 @@ import pytest
 import arrays
 import magloc
 from magloc.calibration.array import calibrate_on_path
-from magloc.calibration.cross_validation import choose_common_field, leave_poses_out
+from magloc.calibration.cross_validation import CrossValidation, choose_common_field, leave_poses_out
 from tests.command_line import Run
 from tests.magloc.calibration.test_array import MOMENT, PRIOR, Passage, passage
 
@@ -74,6 +74,11 @@ class TestCrossValidation:
         fixes = magloc.locate(case.true_array, case.readings_T, body_length_m=0.0)
         least = np.median(np.linalg.norm(fixes.position_m - case.position_m, axis=1))
         assert least < np.median(validation.error_m) < 5.0 * least
+
+    def test_rows_without_a_fix_count_as_the_worst(self) -> None:
+        """Or a calibration that locates only the easy rows would seem better."""
+        assert CrossValidation(np.array([1.0, 3.0, np.nan, np.nan])).mean_m == 2.5
+        assert CrossValidation(np.full(3, np.nan)).mean_m == np.inf
 
     def test_too_few_rows(self) -> None:
         case = passage(3, n=19)

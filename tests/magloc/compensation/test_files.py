@@ -74,3 +74,5 @@ def test_currents_that_are_none(tmp_path: Path, current: str, fragment: str) -> 
     path.write_text("time_s,mag_nT,motor_A\n0,48000,5\n1,48001,6\n")
     with pytest.raises(InputError, match=fragment):
         LogFile.read(path, ONE, [current])
+    with pytest.raises(InputError, match="found motor_A twice"):
+        LogFile.read(path, ONE, ["motor_A", "motor_A"])

@@ -168,6 +168,17 @@ class TestFaultyReadings:
         assert quality.stuck.sum(axis=0).tolist() == [0, 100]
         assert quality.flags == ["missing", "stuck", "spikes"]
 
+    @pytest.mark.parametrize(("scale", "flags"), [(1e-3, ["field"]), (1e3, ["field"]), (0.0, ["stuck"])])
+    def test_all_readings_of_a_sensor(self, scale: float, flags: list[str]) -> None:
+        """Readings in another unit, and one reading all the time: alone, as no other sensor says so."""
+        alone = replace(ROWS, values_T=scale * ROWS.values_T[:, :1] + (5e-5 if not scale else 0.0))
+        found = magloc.check_quality(replace(PAIR, sensors=PAIR.sensors[:1]), alone)
+        assert set(flags) <= set(found.flags)
+
+    def test_a_place_that_does_not_change(self) -> None:
+        still = replace(ROWS, array_position_m=np.tile([1.0, 2.0, 0.5], (len(ROWS), 1)))
+        assert "length" in magloc.check_quality(PAIR, still).flags
+
     def test_bad_input(self) -> None:
         with pytest.raises(ValueError, match="must have the pose"):
             magloc.check_quality(PAIR, magloc.Readings(ROWS.values_T))

@@ -101,6 +101,14 @@ class TestRaster:
         with pytest.raises(arrays.InputError, match="expected terrain that covers"):
             magloc.read_terrain(tmp_path / "dem.tif", LINES, origin=ORIGIN)
 
+    def test_heights_in_feet_by_the_coordinate_system(self, tmp_path: Path) -> None:
+        rasterio = pytest.importorskip("rasterio")
+        write_raster(tmp_path / "dem.tif", "EPSG:25833")
+        with rasterio.open(tmp_path / "dem.tif", "r+") as file:
+            file.crs = "EPSG:25833+6360"
+        with pytest.raises(arrays.InputError, match="found heights in 'US survey foot', expected metres"):
+            magloc.read_terrain(tmp_path / "dem.tif", LINES, origin=ORIGIN)
+
     def test_other_faults(self, tmp_path: Path) -> None:
         rasterio = pytest.importorskip("rasterio")
         write_raster(tmp_path / "dem.tif", "EPSG:25833")
@@ -137,6 +145,18 @@ class TestPoints:
         of_grid = crs if crs == "EPSG:25833" else None
         terrain = magloc.read_terrain(tmp_path / "grid.csv", LINES, origin=crs and ORIGIN, crs=of_grid)
         np.testing.assert_allclose(terrain.height_at(LINES), LINES @ [0.05, -0.02], atol=1e-3)
+
+    @pytest.mark.parametrize("unknown", [-9999.0, -32768.0, 32767.0])
+    def test_numbers_that_stand_for_unknown_heights(self, unknown: float, tmp_path: Path) -> None:
+        """A spline through them would ring below the lines."""
+        x, y = np.meshgrid(np.arange(40.0), np.arange(40.0))
+        height = np.where(x > 30.0, unknown, 0.1 * x)
+        rows = np.stack([x.ravel(), y.ravel(), height.ravel()], axis=1)
+        np.savetxt(tmp_path / "dem.csv", rows, delimiter=",", header="x,y,height", comments="")
+        places = np.array([[8.0, 20.0], [28.0, 20.0]])
+        np.testing.assert_allclose(
+            magloc.read_terrain(tmp_path / "dem.csv", places).height_at(places), 0.1 * places[:, 0], atol=1e-6
+        )
 
     def test_faults(self, tmp_path: Path) -> None:
         path = tmp_path / "grid.csv"

@@ -105,6 +105,8 @@ class TestTerrain:
         assert_refused(run(*line, tmp_path / "far.csv", "--quiet"), "expected terrain that covers all lines")
         assert_refused(run(*line, tmp_path / "none.tif", "--quiet"), "does not exist")
         assert_refused(run(*line, "Sonar", "--quiet"), "column Sonar: found no such column")
+        for column in ("time_s", "low"):
+            assert_refused(run(*line, column, "--quiet"), "expected heights above ground")
         assert_refused(run(*line, folder / "dem.tif", "--ground-m", 47.0, "--quiet"), "--ground-m")
         above = ("survey", folder / "walk.csv", "--array", folder / "ground.toml", "--terrain", "Above")
         assert_refused(run(*above, "--quiet"), "expected heights above the sea or the ellipsoid")

@@ -35,6 +35,8 @@ class TestLog:
             ('{"action": "drop"}', "target"),
             ('{"action": "drop", "target": 3}', "str"),
             ('{"action": "drop", "target": "t1", "reason": "car"}', "reason"),
+            ('{"action": "drop", "target": "t1", "numbers": {"position_m": "here"}}', "3 finite numbers"),
+            ('{"action": "split", "target": "t1", "numbers": {"position_m": [1]}}', "3 finite numbers"),
             ('{"action": "split", "target": "t1", "places_m": [[0, 1]]}', "two places or none"),
             ('{"action": "add", "place_m": [1]}', "2 or 3 finite numbers"),
             ('{"action": "exclude"}', "either polygon_m"),

@@ -216,6 +216,8 @@ class TestRefusals:
     def test_a_place_without_rows(self) -> None:
         with pytest.raises(ValueError, match=r"of a row on the map; instead received \(90, 0\)"):
             reviewed().add([90.0, 0.0])
+        with pytest.raises(ValueError, match="below the ground; instead received one 5 m above it"):
+            reviewed().add([0.0, 0.5, 5.0])
 
     def test_rows_to_exclude(self) -> None:
         with pytest.raises(ValueError, match="must contain a row"):
