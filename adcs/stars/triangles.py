@@ -50,6 +50,8 @@ def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Sta
     neighbours of each star. Each triangle is returned once.
     """
     n = len(directions)
+    if n < 3:
+        return StarTriangles(np.empty((0, 3), np.intp), np.empty((0, 3)), np.empty(0, np.bool_))
     k = min(NEIGHBOURS + 1, n)
     found = np.asarray(cKDTree(directions).query(directions, k=k)[1], dtype=np.intp).reshape(n, k)
     own = np.arange(n)[:, None]
