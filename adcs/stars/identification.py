@@ -17,7 +17,7 @@ from scipy.stats import binom
 from adcs.stars.camera import StarCamera
 from adcs.stars.catalogue import WHOLE_SKY, SkyCap, StarCatalogue
 from adcs.stars.pose import CameraPose, LensPrior, fit_pose
-from adcs.stars.triangles import AttitudeHypothesis, Checks, TriangleIndex, star_triangles
+from adcs.stars.triangles import AttitudeHypothesis, Checks, RankedTriangles, TriangleIndex, star_triangles
 from arrays.typing import FloatArray, IntArray
 
 # Number of brighter neighbours with which a star forms triangles, in the catalogue and in an image with hot pixels.
@@ -102,7 +102,12 @@ class StarMatcher:
 
     @classmethod
     def of(
-        cls, catalogue: StarCatalogue, camera: StarCamera, noise_px: float = 1.0, near: SkyCap = WHOLE_SKY
+        cls,
+        catalogue: StarCatalogue,
+        camera: StarCamera,
+        noise_px: float = 1.0,
+        near: SkyCap = WHOLE_SKY,
+        ranked: RankedTriangles | None = None,
     ) -> StarMatcher:
         """Return a matcher for a camera.
 
@@ -116,16 +121,17 @@ class StarMatcher:
             Standard deviation of a centroid, per axis.
         near : SkyCap
             Part of the sky in which the centre of an image is.
+        ranked : RankedTriangles, optional
+            :func:`ranked_triangles` of the catalogue, which several cameras share.
         """
         seen = cls._seen(near, camera)
         rows = np.arange(len(catalogue.numbers))
         if seen.share < 1.0:
             rows = np.flatnonzero(seen.contains(catalogue.directions))
-            catalogue = catalogue.rows(rows)
+            catalogue, ranked = catalogue.rows(rows), None
         images = 4.0 * math.pi * seen.share / camera.solid_angle_sr
-        bright = np.argsort(catalogue.magnitudes, kind="stable")[: math.ceil(_BRIGHT_PER_IMAGE * images)]
         longest = 2.0 * math.sin(0.5 * camera.diagonal_rad)
-        index = TriangleIndex.of(catalogue.directions[bright], longest, _BRIGHTER)
+        index = TriangleIndex.of(ranked or ranked_triangles(catalogue), math.ceil(_BRIGHT_PER_IMAGE * images), longest)
         return cls(catalogue, rows, near, camera, index, noise_px)
 
     @staticmethod
@@ -265,6 +271,11 @@ class StarMatcher:
         covered = float(np.asarray(around)) * (self.gate_rad(pose.camera) / radius) ** 2
         # At least `matched` - 3 matches; the survival function is that of more than its argument.
         return np.asarray(binom.logsf(matched - 4, np.maximum(stars - 3, 0), min(covered, 1.0)))
+
+
+def ranked_triangles(catalogue: StarCatalogue) -> RankedTriangles:
+    """Return the triangles of a catalogue, which matchers of several cameras share."""
+    return RankedTriangles(catalogue.directions[np.argsort(catalogue.magnitudes, kind="stable")], _BRIGHTER)
 
 
 def identify_stars(
