@@ -37,6 +37,7 @@ def stars(
     aberration: Flag = False,
     dark: Path | None = None,
     near: tuple[float, float, float] | None = None,
+    wcs: Path | None = None,
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
@@ -70,6 +71,8 @@ def stars(
     near : tuple, optional
         Right ascension and declination near which the centre of each image is, and the radius [deg]. It makes the
         search fast. A centre outside the radius is not found.
+    wcs : Path, optional
+        Folder for a FITS header with the world coordinates of each solved photograph, NAME.wcs.
     report : ReportOptions
         Outputs.
     """
@@ -95,7 +98,9 @@ def stars(
     rad_per_px = None if scale_arcsec is None else math.radians(scale_arcsec / 3600.0)
     hint = _cap(near)
     if of_pictures:
-        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, hint, dark, report)
+        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, hint, dark, report, wcs)
+    elif wcs is not None:
+        raise InputError(f"--wcs {wcs}: found a folder of frames, expected photographs.")
     else:
         _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, hint, report)
 
@@ -127,11 +132,15 @@ def _pictures(
     near: SkyCap,
     dark: Path | None,
     report: ReportOptions,
+    wcs: Path | None,
 ) -> None:
     from adcs.plots.stars import picture_figure
     from adcs.stars.identification import NoFix
+    from adcs.stars.wcs import wcs_header
+    from arrays.io.outputs import refuse_file, write_files
 
     report.check()
+    refuse_file(wcs, "--wcs")
     off = None if dark is None else adcs.read_picture(dark)
     rows, solved = [], []
     for path in paths:
@@ -170,6 +179,9 @@ def _pictures(
         (f"{path.stem}-stars.png", picture_figure(path.name, picture, lights, fix, known))
         for path, picture, lights, fix in solved
     )
+    headers = [(f"{path.stem}.wcs", wcs_header(fix)) for path, _, _, fix in solved if fix is not None]
+    if headers:
+        write_files(wcs, headers, "--wcs")
     report.print({"pictures": rows}, [_picture_line(row) for row in rows])
 
 
