@@ -18,7 +18,7 @@ from arrays.typing import FloatArray
 from magloc.cli.framework import ABOVE_ZERO, Flag, progress, refuse_outside
 
 if TYPE_CHECKING:
-    from adcs.stars.catalogue import StarCatalogue
+    from adcs.stars.catalogue import SkyCap, StarCatalogue
     from adcs.stars.files import StarFrame
     from adcs.stars.identification import NoFix, StarFix
 
@@ -36,6 +36,8 @@ def stars(
     year: float = 2015.0,
     aberration: Flag = False,
     dark: Path | None = None,
+    near: tuple[float, float, float] | None = None,
+    wcs: Path | None = None,
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
@@ -66,6 +68,11 @@ def stars(
         arc seconds. Needs the extra "satellites".
     dark : Path, optional
         Dark frame: a photograph without sky, which is subtracted.
+    near : tuple, optional
+        Right ascension and declination near which the centre of each image is, and the radius [deg]. It makes the
+        search fast. A centre outside the radius is not found.
+    wcs : Path, optional
+        Folder for a FITS header with the world coordinates of each solved photograph, NAME.wcs.
     report : ReportOptions
         Outputs.
     """
@@ -89,10 +96,31 @@ def stars(
 
         known = known.aberrated(earth_velocity_m_s(of_julian_year(year)))
     rad_per_px = None if scale_arcsec is None else math.radians(scale_arcsec / 3600.0)
+    hint = _cap(near)
     if of_pictures:
-        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, dark, report)
+        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, hint, dark, report, wcs)
+    elif wcs is not None:
+        raise InputError(f"--wcs {wcs}: found a folder of frames, expected photographs.")
     else:
-        _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, report)
+        _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, hint, report)
+
+
+def _cap(near: tuple[float, float, float] | None) -> SkyCap:
+    """Return the part of the sky that the option ``--near`` states."""
+    from adcs.stars.catalogue import WHOLE_SKY, SkyCap
+
+    if near is None:
+        return WHOLE_SKY
+    ra_deg, dec_deg, radius_deg = near
+    for name, value, low, high in (
+        ("right ascension", ra_deg, -360.0, 360.0),
+        ("declination", dec_deg, -90.0, 90.0),
+        ("radius", radius_deg, ABOVE_ZERO, 180.0),
+    ):
+        if not low <= value <= high:
+            expected = "above 0, at most 180°" if name == "radius" else f"{low:g} to {high:g}°"
+            raise InputError(f"--near: found the {name} {value:g}°, expected {expected}.")
+    return SkyCap.of(*(math.radians(value) for value in near))
 
 
 def _pictures(
@@ -101,13 +129,18 @@ def _pictures(
     rad_per_px: float | None,
     tolerance: float,
     noise_px: float,
+    near: SkyCap,
     dark: Path | None,
     report: ReportOptions,
+    wcs: Path | None,
 ) -> None:
     from adcs.plots.stars import picture_figure
     from adcs.stars.identification import NoFix
+    from adcs.stars.wcs import wcs_header
+    from arrays.io.outputs import refuse_file, write_files
 
     report.check()
+    refuse_file(wcs, "--wcs")
     off = None if dark is None else adcs.read_picture(dark)
     rows, solved = [], []
     for path in paths:
@@ -115,7 +148,7 @@ def _pictures(
         began = time.perf_counter()
         with naming(str(path)):
             lights, found = adcs.solve_photograph(
-                picture, known, rad_per_px=rad_per_px, tolerance=tolerance, noise_px=noise_px, dark=off
+                picture, known, rad_per_px=rad_per_px, tolerance=tolerance, noise_px=noise_px, near=near, dark=off
             )
         took_ms = 1e3 * (time.perf_counter() - began)
         row: dict[str, Any] = {"file": str(path), "solved": not isinstance(found, NoFix)}
@@ -146,6 +179,9 @@ def _pictures(
         (f"{path.stem}-stars.png", picture_figure(path.name, picture, lights, fix, known))
         for path, picture, lights, fix in solved
     )
+    headers = [(f"{path.stem}.wcs", wcs_header(fix)) for path, _, _, fix in solved if fix is not None]
+    if headers:
+        write_files(wcs, headers, "--wcs")
     report.print({"pictures": rows}, [_picture_line(row) for row in rows])
 
 
@@ -175,6 +211,7 @@ def _frames(
     rad_per_px: float | None,
     tolerance: float | None,
     noise_px: float,
+    near: SkyCap,
     report: ReportOptions,
 ) -> None:
     from adcs.stars.files import read_star_frames
@@ -199,7 +236,7 @@ def _frames(
 
         prior = LensPrior() if tolerance is None else replace(UNKNOWN_LENS, scale=tolerance)
         frames_of = [(image.points_px, image.magnitudes) for image in images]
-        fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, lens=prior, progress=done)
+        fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, lens=prior, near=near, progress=done)
     rows = [_row(known, image, fix) for image, fix in zip(images, fixes, strict=True)]
     # The time of the first frame includes the triangles of the catalogue.
     milliseconds = 1e3 * np.diff(ended)[min(1, len(images) - 1) :]

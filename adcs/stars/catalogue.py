@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -11,10 +12,55 @@ from numpy.typing import ArrayLike
 from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
 
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 
 CELLS = 64
 """Number of cells of the sky's cube along each axis."""
+
+
+class SkyCap(NamedTuple):
+    """Part of the sky around a direction.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (3,)
+        Unit vector in the catalogue's frame.
+    radius_rad : float
+        Largest angle from the centre.
+    """
+
+    centre: FloatArray
+    radius_rad: float
+
+    @classmethod
+    def of(cls, right_ascension_rad: float, declination_rad: float, radius_rad: float) -> SkyCap:
+        """Return the cap around right ascension and declination."""
+        ra, dec = right_ascension_rad, declination_rad
+        centre = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+        return cls(centre, radius_rad)
+
+    @property
+    def share(self) -> float:
+        """Solid angle over that of the whole sky."""
+        return math.sin(0.5 * min(self.radius_rad, math.pi)) ** 2
+
+    def widened(self, by_rad: float) -> SkyCap:
+        """Return the cap with a larger radius."""
+        return self._replace(radius_rad=self.radius_rad + by_rad)
+
+    def contains(self, directions: FloatArray) -> BoolArray:
+        """Return which unit vectors (…, 3) are inside."""
+        half = 0.5 * np.linalg.norm(directions - self.centre, axis=-1)
+        return np.asarray(2.0 * np.arcsin(np.minimum(half, 1.0)) <= self.radius_rad)
+
+    def __str__(self) -> str:
+        x, y, z = self.centre.tolist()
+        ra, dec = math.degrees(math.atan2(y, x)) % 360.0, math.degrees(math.asin(z))
+        return f"RA {ra:.3f}°, Dec {dec:+.3f}° within {math.degrees(self.radius_rad):g}°"
+
+
+WHOLE_SKY = SkyCap(np.array([0.0, 0.0, 1.0]), math.pi)
+"""Cap that contains every direction."""
 
 
 class SkyCells(NamedTuple):
@@ -76,6 +122,10 @@ class StarCatalogue:
         moved = slower * self.directions + np.outer(1.0 + along / (1.0 + slower), beta)
         return replace(self, directions=moved / (1.0 + along[:, None]))
 
+    def rows(self, rows: IntArray) -> StarCatalogue:
+        """Return the catalogue of some rows."""
+        return StarCatalogue(self.numbers[rows], self.directions[rows], self.magnitudes[rows])
+
     @cached_property
     def tree(self) -> cKDTree:
         """Search tree of the directions."""
@@ -87,4 +137,5 @@ class StarCatalogue:
         cell = np.clip(((self.directions + 1.0) * (0.5 * CELLS)).astype(np.intp), 0, CELLS - 1)
         number = cell @ np.array([CELLS * CELLS, CELLS, 1])
         order = np.argsort(number, kind="stable")
-        return SkyCells(self.directions[order], np.searchsorted(number[order], np.arange(CELLS**3 + 1)))
+        begins = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=CELLS**3))])
+        return SkyCells(self.directions[order], begins)

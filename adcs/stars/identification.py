@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from scipy.stats import binom
 
 from adcs.stars.camera import StarCamera
-from adcs.stars.catalogue import StarCatalogue
+from adcs.stars.catalogue import WHOLE_SKY, SkyCap, StarCatalogue
 from adcs.stars.pose import CameraPose, LensPrior, fit_pose
-from adcs.stars.triangles import AttitudeHypothesis, Checks, TriangleIndex, star_triangles
+from adcs.stars.triangles import AttitudeHypothesis, Checks, RankedTriangles, TriangleIndex, star_triangles
 from arrays.typing import FloatArray, IntArray
 
 # Number of brighter neighbours with which a star forms triangles, in the catalogue and in an image with hot pixels.
@@ -28,6 +28,7 @@ _IMAGE_STARS = 30
 _CHECKED = 24
 # Largest number of checked triangle matches of an image: a second of computing.
 _MOST_HYPOTHESES = 250_000
+_WIDER = 1.1  # field of view over the stated one, by an error of the scale
 _ROUNDS = 3  # largest number of groups of hypotheses that are fitted
 _CROWDED = 4.0  # largest density of stars over the mean
 _WIDENED = 2.0  # gate of a hypothesis from three noisy stars over the usual one
@@ -76,7 +77,11 @@ class StarMatcher:
     Attributes
     ----------
     catalogue : StarCatalogue
-        Stars at the date of the images.
+        Stars that an image with its centre in the cap may show, at the date of the images.
+    rows : ndarray, shape (n,)
+        Their rows in the whole catalogue.
+    near : SkyCap
+        Part of the sky in which the centre of an image is.
     camera : StarCamera
         Camera of the images.
     index : TriangleIndex
@@ -88,13 +93,22 @@ class StarMatcher:
     """
 
     catalogue: StarCatalogue
+    rows: IntArray
+    near: SkyCap
     camera: StarCamera
     index: TriangleIndex
     noise_px: float = 1.0
     most_chance: float = 1e-6
 
     @classmethod
-    def of(cls, catalogue: StarCatalogue, camera: StarCamera, noise_px: float = 1.0) -> StarMatcher:
+    def of(
+        cls,
+        catalogue: StarCatalogue,
+        camera: StarCamera,
+        noise_px: float = 1.0,
+        near: SkyCap = WHOLE_SKY,
+        ranked: RankedTriangles | None = None,
+    ) -> StarMatcher:
         """Return a matcher for a camera.
 
         Parameters
@@ -105,11 +119,25 @@ class StarMatcher:
             Camera of the images.
         noise_px : float
             Standard deviation of a centroid, per axis.
+        near : SkyCap
+            Part of the sky in which the centre of an image is.
+        ranked : RankedTriangles, optional
+            :func:`ranked_triangles` of the catalogue, which several cameras share.
         """
-        per_image = camera.solid_angle_sr / (4.0 * math.pi)
-        bright = np.argsort(catalogue.magnitudes, kind="stable")[: math.ceil(_BRIGHT_PER_IMAGE / per_image)]
+        seen = cls._seen(near, camera)
+        rows = np.arange(len(catalogue.numbers))
+        if seen.share < 1.0:
+            rows = np.flatnonzero(seen.contains(catalogue.directions))
+            catalogue, ranked = catalogue.rows(rows), None
+        images = 4.0 * math.pi * seen.share / camera.solid_angle_sr
         longest = 2.0 * math.sin(0.5 * camera.diagonal_rad)
-        return cls(catalogue, camera, TriangleIndex.of(catalogue.directions[bright], longest, _BRIGHTER), noise_px)
+        index = TriangleIndex.of(ranked or ranked_triangles(catalogue), math.ceil(_BRIGHT_PER_IMAGE * images), longest)
+        return cls(catalogue, rows, near, camera, index, noise_px)
+
+    @staticmethod
+    def _seen(near: SkyCap, camera: StarCamera) -> SkyCap:
+        """Return the part of the sky that images with their centre in the cap show."""
+        return near.widened(_WIDER * 0.5 * camera.diagonal_rad)
 
     def gate_rad(self, camera: StarCamera) -> float:
         """Return the matching radius of a star of the image: three standard deviations."""
@@ -151,8 +179,8 @@ class StarMatcher:
         order = np.argsort(brightness, kind="stable")
         if order.shape != (len(tangents),):
             raise ValueError(f"Input magnitudes must have shape ({len(tangents)},); instead received {order.shape}.")
-        if len(order) < 4:
-            return NoFix(f"{len(order)} stars, 4 needed")
+        if min(len(order), len(self.rows)) < 4:
+            return self._unsolved(f"{min(len(order), len(self.rows))} stars, 4 needed")
         points = np.asarray(points_px, dtype=np.float64)[order]
         if mirrored:
             points = points * [-1.0, 1.0] + [self.camera.width_px, 0.0]
@@ -165,10 +193,16 @@ class StarMatcher:
             fixes = [self._fit(points, brightness[order], hypothesis, prior) for hypothesis in hypotheses]
             best = min(fixes, key=lambda fix: fix.log10_chance)
             if best.log10_chance <= math.log10(self.most_chance):
-                stars = np.stack([order[best.stars[:, 0]], best.stars[:, 1]], axis=1)
+                if not self.near.contains(-best.R_catalogue_from_frame[:, 2]):
+                    return self._unsolved("the centre that fits the stars is outside")
+                stars = np.stack([order[best.stars[:, 0]], self.rows[best.stars[:, 1]]], axis=1)
                 return replace(best, stars=stars, mirrored=mirrored)
             reason = f"chance matches {len(best.stars)} of {len(points)} stars too easily"
-        return NoFix(reason)
+        return self._unsolved(reason)
+
+    def _unsolved(self, reason: str) -> NoFix:
+        """Return the reason, with the hint of direction if there is one."""
+        return NoFix(reason if self.near.share >= 1.0 else f"not solved near {self.near}: {reason}")
 
     def _checks(self, stars: int, prior: LensPrior) -> Checks:
         """Return the limits of the search.
@@ -177,7 +211,8 @@ class StarMatcher:
         crowded part of the sky.
         """
         near = _WIDENED * self.gate_rad(self.camera)
-        crowd = min(_CROWDED * len(self.catalogue.numbers) * (0.5 * near) ** 2, 1.0)
+        share = self._seen(self.near, self.camera).share
+        crowd = min(_CROWDED * len(self.catalogue.numbers) / share * (0.5 * near) ** 2, 1.0)
         chance = binom.logsf(np.arange(stars) - 3, max(stars - 3, 0), crowd) + math.log(_MOST_HYPOTHESES)
         enough = int(np.count_nonzero(chance > math.log(0.01 * self.most_chance)))
         return Checks(4.0 * self.noise_px * self.camera.rad_per_px, prior.scale, near, stars, enough, _MOST_HYPOTHESES)
@@ -238,6 +273,11 @@ class StarMatcher:
         return np.asarray(binom.logsf(matched - 4, np.maximum(stars - 3, 0), min(covered, 1.0)))
 
 
+def ranked_triangles(catalogue: StarCatalogue) -> RankedTriangles:
+    """Return the triangles of a catalogue, which matchers of several cameras share."""
+    return RankedTriangles(catalogue.directions[np.argsort(catalogue.magnitudes, kind="stable")], _BRIGHTER)
+
+
 def identify_stars(
     catalogue: StarCatalogue,
     camera: StarCamera,
@@ -245,6 +285,7 @@ def identify_stars(
     *,
     noise_px: float = 1.0,
     lens: LensPrior = LensPrior(),  # noqa: B008 - frozen
+    near: SkyCap = WHOLE_SKY,
     progress: Callable[[int], None] | None = None,
 ) -> list[StarFix | NoFix]:
     """Identify attitude and stars of images without a prior attitude.
@@ -261,6 +302,8 @@ def identify_stars(
         Standard deviation of a star's place, per axis.
     lens : LensPrior
         Errors of the camera's scale and distortion, such as ``adcs.stars.pose.UNKNOWN_LENS``; by default none.
+    near : SkyCap
+        Part of the sky in which the centre of each image is; by default the whole sky.
     progress : callable, optional
         Function that is called with 1 after each image.
 
@@ -284,7 +327,7 @@ def identify_stars(
     >>> images = [(frame.points_px, frame.magnitudes) for frame in frames]  # doctest: +SKIP
     >>> adcs.identify_stars(catalogue, camera, images)  # doctest: +SKIP
     """
-    matcher = StarMatcher.of(catalogue, camera, noise_px)
+    matcher = StarMatcher.of(catalogue, camera, noise_px, near)
     fixes = []
     for points_px, magnitudes in frames:
         fix = matcher.identify(points_px, magnitudes, lens)

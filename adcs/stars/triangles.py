@@ -18,6 +18,8 @@ NEIGHBOURS = 24
 """Number of nearest neighbours among which brighter stars are searched."""
 KEPT = 8
 """Number of best hypotheses."""
+_FIRST_LEVEL, _LEVEL_NEIGHBOURS = 24, 16
+"""Number of stars of the first level of a catalogue's triangles, and of nearest neighbours in the later ones."""
 _RATIOS = 64
 """Number of cells of a ratio of two sides."""
 _BLOCK = 16
@@ -43,20 +45,27 @@ class Checks(NamedTuple):
     most: int  # number of attitudes that ends a search
 
 
-def star_triangles(directions: FloatArray, longest: float, brighter: int) -> StarTriangles:
+def star_triangles(
+    directions: FloatArray, longest: float, brighter: int, *, first: int = 0, neighbours: int = NEIGHBOURS
+) -> StarTriangles:
     """Return the triangles of each star with its nearest brighter neighbours.
 
     ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. ``brighter``: number of
-    neighbours of each star. Each triangle is returned once.
+    neighbours of each star, among the ``neighbours`` nearest. Each triangle is returned once. ``first``: row from which
+    on stars make triangles with brighter ones.
     """
     n = len(directions)
-    k = min(NEIGHBOURS + 1, n)
-    found = np.asarray(cKDTree(directions).query(directions, k=k)[1], dtype=np.intp).reshape(n, k)
-    own = np.arange(n)[:, None]
-    first = np.argsort(found >= own, axis=1, kind="stable")[:, : min(brighter, k)]
-    nearest = np.take_along_axis(found, first, axis=1)
+    if n < 3:
+        return StarTriangles(np.empty((0, 3), np.intp), np.empty((0, 3)), np.empty(0, np.bool_))
+    k = min(neighbours + 1, n)
+    found = np.asarray(cKDTree(directions).query(directions[first:], k=k)[1], dtype=np.intp).reshape(-1, k)
+    own = np.arange(first, n)[:, None]
+    order = np.argsort(found >= own, axis=1, kind="stable")[:, : min(brighter, k)]
+    nearest = np.take_along_axis(found, order, axis=1)
     one, two = np.array(list(combinations(range(nearest.shape[1]), 2)), dtype=np.intp).reshape(-1, 2).T
-    corners = np.stack([np.broadcast_to(own, (n, len(one))), nearest[:, one], nearest[:, two]], axis=-1).reshape(-1, 3)
+    corners = np.stack([np.broadcast_to(own, (len(own), len(one))), nearest[:, one], nearest[:, two]], axis=-1).reshape(
+        -1, 3
+    )
     corners = corners[(corners[:, 1:] < corners[:, :1]).all(axis=1)]
     at = directions[corners]
     opposite = np.linalg.norm(at[:, [1, 2, 0]] - at[:, [2, 0, 1]], axis=-1)
@@ -66,6 +75,42 @@ def star_triangles(directions: FloatArray, longest: float, brighter: int) -> Sta
     # The triple product is positive for corners that are clockwise seen from the centre.
     a, b, c = np.moveaxis(directions[corners[short]], 1, 0)
     return StarTriangles(corners[short], sides[short], np.sum(np.cross(a, b) * c, axis=-1) < 0.0)
+
+
+class RankedTriangles:
+    """Triangles of a catalogue, computed down to the brightness that is asked for.
+
+    A star's nearest brighter neighbours do not depend on fainter stars, so those of fewer stars are among those of
+    more.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (n, 3)
+        Unit vectors, brightest first.
+    brighter : int
+        Number of brighter neighbours of each star.
+    """
+
+    def __init__(self, directions: FloatArray, brighter: int) -> None:
+        self.directions = directions
+        self._brighter = brighter
+        self._levels = [star_triangles(directions[:_FIRST_LEVEL], 2.0, brighter)]
+        self._done = min(_FIRST_LEVEL, len(directions))
+
+    def of_brightest(self, n: int, longest: float) -> StarTriangles:
+        """Return the triangles of the ``n`` brightest stars whose longest side, a chord, is at most ``longest``."""
+        n = min(n, len(self.directions))
+        while self._done < n:
+            # Half of the neighbours or more are brighter than any star of the level.
+            end = min(2 * self._done, n)
+            level = star_triangles(
+                self.directions[:end], 2.0, self._brighter, first=self._done, neighbours=_LEVEL_NEIGHBOURS
+            )
+            self._levels.append(level)
+            self._done = end
+        corners, sides, turns = (np.concatenate(parts) for parts in zip(*self._levels, strict=True))
+        within = (sides[:, 2] <= longest) & (corners.max(axis=1, initial=0) < n)
+        return StarTriangles(corners[within], sides[within], turns[within])
 
 
 @dataclass(frozen=True)
@@ -86,15 +131,15 @@ class TriangleIndex:
     begins: IntArray  # (_RATIOS² + 1,): first triangle of each cell
 
     @classmethod
-    def of(cls, bright: FloatArray, longest: float, brighter: int) -> TriangleIndex:
-        """Return the index of all triangles of these stars; see :func:`star_triangles`."""
-        made = star_triangles(bright, longest, brighter)
+    def of(cls, ranked: RankedTriangles, brightest: int, longest: float) -> TriangleIndex:
+        """Return the index of the triangles of the brightest stars; see :meth:`RankedTriangles.of_brightest`."""
+        made = ranked.of_brightest(brightest, longest)
         ratios = np.minimum((made.sides[:, :2] / made.sides[:, 2:] * _RATIOS).astype(np.intp), _RATIOS - 1)
         cell = ratios @ np.array([_RATIOS, 1])
         order = np.lexsort((made.sides[:, 2], cell))
         begins = np.searchsorted(cell[order], np.arange(_RATIOS**2 + 1))
         ordered = StarTriangles(made.corners[order], made.sides[order], made.is_counter_clockwise[order])
-        return cls(bright, ordered, begins)
+        return cls(ranked.directions[:brightest], ordered, begins)
 
     def best(
         self, tangents: FloatArray, image: StarTriangles, sky: SkyCells, checks: Checks

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs.stars.camera import WIDEST_RAD, StarCamera
-from adcs.stars.catalogue import StarCatalogue
-from adcs.stars.identification import NoFix, StarFix, StarMatcher
+from adcs.stars.catalogue import WHOLE_SKY, SkyCap, StarCatalogue
+from adcs.stars.identification import NoFix, StarFix, StarMatcher, ranked_triangles
 from adcs.stars.pictures import LEAST_PX, PictureStars, find_picture_stars
 from adcs.stars.pose import UNKNOWN_LENS
 from arrays.io.errors import check_positive
@@ -32,6 +33,7 @@ def solve_photograph(
     rad_per_px: float | None = None,
     tolerance: float = 0.05,
     noise_px: float = 0.5,
+    near: SkyCap = WHOLE_SKY,
     dark: ArrayLike | None = None,
 ) -> tuple[PictureStars, StarFix | NoFix]:
     """Identify attitude, scale and stars of a photograph of the sky.
@@ -48,6 +50,9 @@ def solve_photograph(
         Relative error of that scale, at most 0.1.
     noise_px : float
         Standard deviation of a star's place, with errors of the lens.
+    near : SkyCap
+        Part of the sky in which the picture's centre is, such as ``adcs.stars.catalogue.SkyCap.of(ra_rad, dec_rad,
+        radius_rad)``; by default the whole sky.
     dark : array_like, shape (height, width), optional
         Picture of the camera without light, which is subtracted.
 
@@ -87,6 +92,7 @@ def solve_photograph(
         rad_per_px=rad_per_px,
         tolerance=tolerance,
         noise_px=noise_px,
+        near=near,
     )
     return stars, found
 
@@ -101,11 +107,13 @@ def identify_at_unknown_scale(
     rad_per_px: float | None = None,
     tolerance: float = 0.05,
     noise_px: float = 0.5,
+    near: SkyCap = WHOLE_SKY,
 ) -> StarFix | NoFix:
     """Identify attitude, scale and stars of a picture.
 
     ``rad_per_px``: scale at the centre with the relative error ``tolerance``, at most 0.1; by default fields of 3 to
     45° from corner to corner are tried. ``noise_px``: standard deviation of a star's place, with errors of the lens.
+    ``near``: part of the sky in which the picture's centre is.
     """
     check_positive(tolerance=tolerance, noise_px=noise_px)
     if tolerance > _WIDEST_TOLERANCE:
@@ -115,12 +123,19 @@ def identify_at_unknown_scale(
     if len(points) < 4:
         return NoFix(f"{len(points)} stars, 4 needed")
     scales, within = _scales(math.hypot(width_px, height_px), rad_per_px, tolerance)
+    ranked = ranked_triangles(catalogue)
+
+    @cache
+    def matcher_of(scale: float) -> StarMatcher:
+        return StarMatcher.of(catalogue, StarCamera(width_px, height_px, scale), noise_px, near, ranked)
+
     for mirrored, scale in product((False, True), scales):
-        matcher = StarMatcher.of(catalogue, StarCamera(width_px, height_px, scale), noise_px)
+        matcher = matcher_of(scale)
         fix = matcher.identify(points, magnitudes, replace(UNKNOWN_LENS, scale=within), mirrored=mirrored)
         if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(scales)):
             return replace(fix, stars=np.stack([brightest[fix.stars[:, 0]], fix.stars[:, 1]], axis=1))
-    return NoFix(f"no scale of {len(scales)} explains the {len(points)} brightest lights, mirrored or not")
+    where = "" if near.share >= 1.0 else f"not solved near {near}: "
+    return NoFix(f"{where}no scale of {len(scales)} explains the {len(points)} brightest lights, mirrored or not")
 
 
 def _scales(diagonal_px: float, rad_per_px: float | None, tolerance: float) -> tuple[list[float], float]:
@@ -130,8 +145,9 @@ def _scales(diagonal_px: float, rad_per_px: float | None, tolerance: float) -> t
     step = (1.0 + _WIDEST_TOLERANCE) / (1.0 - _WIDEST_TOLERANCE)
     n = math.ceil(math.log(_LAST_FIELD_RAD / _FIRST_FIELD_RAD) / math.log(step))
     fields = _FIRST_FIELD_RAD * step ** np.arange(n + 1)
-    # Fields near ten degrees come first, as most star cameras have them.
-    fields = fields[np.argsort(np.abs(np.log(fields / math.radians(10.0))))]
+    # Fields near ten degrees come first, as most star cameras have them. The narrowest need the most triangles.
+    from_usual = np.log(fields / math.radians(10.0))
+    fields = fields[np.argsort(np.where(from_usual < -0.3, 10.0 - from_usual, np.abs(from_usual)))]
     return [
         math.atan(2.0 * math.tan(0.5 * min(field, WIDEST_RAD)) / diagonal_px) for field in fields
     ], _WIDEST_TOLERANCE

@@ -129,7 +129,7 @@ LINES: dict[str, tuple[str, ...]] = {
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": (
         "frames --catalogue stars.csv --json",
-        "sky.png --catalogue stars.csv --scale-arcsec 15.8 --out out --json",
+        "sky.png --catalogue stars.csv --scale-arcsec 15.8 --near 40 20 5 --wcs out --json",
     ),
 }  # fmt: skip
 _OF_GROUND = ("time_s", "array_x_m", "array_y_m", "array_z_m", "m_nT")

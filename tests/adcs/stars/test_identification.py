@@ -10,6 +10,7 @@ pose and covariance              the truth, whitened by the covariance (NEES); t
 import json
 import math
 import re
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from adcs.stars.catalogue import StarCatalogue
 from adcs.stars.files import read_star_frames
 from adcs.stars.identification import NoFix, StarFix, StarMatcher, identify_stars
 from adcs.stars.pose import UNKNOWN_LENS, CameraPose, fit_pose
-from adcs.stars.triangles import KEPT, Checks, TriangleIndex, star_triangles
+from adcs.stars.triangles import KEPT, Checks, RankedTriangles, TriangleIndex, star_triangles
 from arrays.io.errors import InputError
 from tests.adcs.refusals import assert_refused
 
@@ -119,10 +120,29 @@ class TestGeometry:
         assert (np.diff(many.sides, axis=1) >= 0.0).all()
         assert many.sides.max() <= 0.3
 
+    @pytest.mark.parametrize("sizes", [(1500,), (700, 1500), (3000, 1500)])
+    def test_ranked_triangles_are_those_of_the_nearest_brighter_stars(self, sizes):
+        """All pairs of stars say which are nearest; of 16 neighbours fewer than 4 are brighter for 1 % of the stars."""
+        directions, ranked = random_sky(3000).directions, RankedTriangles(random_sky(3000).directions, 4)
+        for n in sizes:
+            found = ranked.of_brightest(n, 0.3)
+        known = {frozenset(corners) for corners in found.corners.tolist()}
+        assert len(known) == len(found.corners)
+        assert found.sides.max() <= 0.3
+        expected = set()
+        for i in range(4, 1500):
+            nearest = np.argsort(-directions[:i] @ directions[i])[:4]
+            for pair in combinations(nearest.tolist(), 2):
+                corners = directions[[i, *pair]]
+                if max(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)) <= 0.3:
+                    expected.add(frozenset((i, *pair)))
+        assert len(known & expected) > 0.97 * len(expected)
+        assert len(known - expected) < 0.03 * len(expected)
+
     def test_stars_at_one_place_make_no_triangle(self):
         directions = np.tile([1.0, 0.0, 0.0], (10, 1))
         assert not len(star_triangles(directions, 0.3, 4).sides)
-        assert not len(TriangleIndex.of(directions, 0.3, 4).triangles.sides)
+        assert not len(TriangleIndex.of(RankedTriangles(directions, 4), 10, 0.3).triangles.sides)
 
     @pytest.mark.parametrize(
         ("camera", "text"),
@@ -179,7 +199,7 @@ class TestCompiledSearch:
         points, magnitudes, _ = image_of(sky, Rotation.random(random_state=21).as_matrix(), rng, camera=camera)
         points = points[np.argsort(magnitudes)]
         tangents = camera.tangents(points)
-        index = TriangleIndex.of(sky.directions[np.argsort(sky.magnitudes)[:1000]], 1.0, 4)
+        index = TriangleIndex.of(RankedTriangles(sky.directions[np.argsort(sky.magnitudes)], 4), 1000, 1.0)
         image = star_triangles(camera.directions(points[:20]), 2.0, 4)
         checks = Checks(0.02, scale, 0.01, 15, 1000, 10**9)
         R, factor = hypotheses(index, tangents, image, checks)

@@ -18,6 +18,7 @@ from adcs.cli.app import main
 from adcs.environment.sun import earth_velocity_m_s
 from adcs.frames import of_julian_year
 from adcs.stars.camera import StarCamera
+from adcs.stars.catalogue import SkyCap
 from adcs.stars.files import read_star_frames
 from adcs.stars.identification import NoFix, StarFix, StarMatcher
 from adcs.stars.pictures import find_picture_stars, read_picture
@@ -194,6 +195,26 @@ class TestUnknownScale:
         assert found.pose.camera.corner_shift_px == pytest.approx(corner_px, abs=5.0 * sigma_px)
         assert sigma_px < 0.3
 
+    @pytest.mark.parametrize("rad_per_px", [CAMERA.rad_per_px, None])
+    def test_a_hint_of_direction_is_kept(self, rad_per_px):
+        """Same stars as without it; a hint 5° off with a radius of 3° gives no fix, although the picture has one."""
+        R = Rotation.random(random_state=11).as_matrix()
+        picture, points, rows = photograph(SKY, CAMERA, R, np.random.default_rng(11))
+        right = SkyCap(Rotation.from_rotvec(math.radians(2.0) * R[:, 0]).apply(-R[:, 2]), math.radians(3.0))
+        wrong = SkyCap(Rotation.from_rotvec(math.radians(5.0) * R[:, 1]).apply(-R[:, 2]), math.radians(3.0))
+        lights, found = solve_photograph(picture, SKY, rad_per_px=rad_per_px, near=right)
+        assert is_right(found, R)
+        distance, star = cKDTree(points).query(lights.points_px[found.stars[:, 0]])
+        assert (rows[star[distance < 1.0]] == found.stars[distance < 1.0, 1]).mean() > 0.95
+        _, nothing = solve_photograph(picture, SKY, rad_per_px=rad_per_px, near=wrong)
+        assert re.match(r"not solved near RA [\d.]+°, Dec [-+][\d.]+° within 3°: ", nothing.reason)
+
+    def test_a_hint_where_the_catalogue_is_empty(self):
+        few = SKY.rows(np.flatnonzero(SKY.directions[:, 2] > 0.5))
+        picture, _, _ = photograph(SKY, CAMERA, np.eye(3), np.random.default_rng(1))
+        _, nothing = solve_photograph(picture, few, rad_per_px=1e-4, near=SkyCap.of(0.0, -1.5, 0.1))
+        assert "not solved near" in nothing.reason
+
     def test_refusals(self):
         points, ones = np.ones((5, 2)), np.ones(5)
         with pytest.raises(ValueError, match=r"tolerance must be at most 0\.1"):
@@ -312,11 +333,26 @@ class TestCommand:
             (["--year", "1e9"], "--year: found 1e+09, expected 1900 to 2100"),
             (["--scale-tolerance", "0.5"], "--scale-tolerance: found 0.5, expected a positive number, 0.1 at most"),
             (["--dark", "none.png"], "none.png does not exist"),
+            (["--near", "10", "-95", "3"], "--near: found the declination -95°, expected -90 to 90°"),
+            (["--near", "400", "5", "3"], "--near: found the right ascension 400°, expected -360 to 360°"),
+            (["--near", "10", "5", "0"], "--near: found the radius 0°, expected above 0, at most 180°"),
         ],
     )
     def test_refusals(self, files, capsys, arguments, said):
         assert main(["stars", str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), *arguments]) == 2
         assert said in capsys.readouterr().err
+
+    def test_near(self, files, capsys):
+        """A right hint changes nothing; a wrong one is named."""
+        arguments = ["stars", str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), "--scale-arcsec", "61"]
+        assert main([*arguments, "--json"]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["pictures"]
+        ra, dec = row["ra_deg"], row["dec_deg"]
+        assert main([*arguments, "--json", "--near", f"{ra + 0.5}", f"{dec}", "1"]) == 0
+        (same,) = json.loads(capsys.readouterr().out)["pictures"]
+        assert (same["ra_deg"], same["dec_deg"]) == pytest.approx((ra, dec), abs=1e-3)
+        assert main([*arguments, "--near", f"{ra + 180.0 - 360.0 * (ra > 180.0)}", f"{-dec}", "1"]) == 0
+        assert ": no fix, not solved near RA " in capsys.readouterr().out
 
     def test_aberration_moves_the_centre(self, files, capsys):
         """By what the Earth's velocity across the line of sight is of that of light."""
