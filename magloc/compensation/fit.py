@@ -278,12 +278,13 @@ class LinearProblem:
         Y = np.ascontiguousarray(Y)
         white.whiten(Y, np.arange(len(Y)))
         A, y = Y[:, 0, :m], Y[:, 0, m]
-        information = A.T @ A + np.eye(m)
-        root = np.linalg.cholesky(information)
-        covariance = np.asarray(np.linalg.inv(information))
+        # Of the columns themselves: their products are singular in double precision where some are nearly equal.
+        root = np.linalg.qr(np.concatenate([A, np.eye(m)]), mode="r")
+        inverse = np.linalg.inv(root)
+        covariance = np.asarray(inverse @ inverse.T)
         mean = covariance @ (A.T @ y)
         residual = y - A @ mean
-        evidence = float(y @ residual) + 2.0 * float(np.log(np.diagonal(root)).sum())
+        evidence = float(y @ residual) + 2.0 * float(np.log(np.abs(np.diagonal(root))).sum())
         evidence -= 2.0 * float(np.log(white.gains[:, 0, -1]).sum()) - 2.0 * len(y) * float(np.log(background.noise_nT))
         return Posterior(mean, covariance, residual, A, evidence)
 

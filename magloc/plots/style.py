@@ -47,6 +47,7 @@ _FEW_DECADES, _FEW_TIMES, _NO_TIMES = 30.0, 4.0, 2.5
 _FEW_MARKERS = 40
 _FEWEST_TICKS = 3
 # Numbers within this relative difference are equal.
+_PIXELS = 2000  # more than a figure has across
 _ROUNDING = 1e-9
 FEW_SENSORS, _MOST_LABELLED_SENSORS = 10, 60
 
@@ -268,11 +269,14 @@ def _finite_values(values: Sequence[FloatArray]) -> FloatArray:
 
 def shade_gaps(ax: Axes, time_s: FloatArray, present: NDArray[np.bool_], label: str) -> None:
     """Hatch the times of successive rows without data."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~present, [False]]).astype(np.int8)))
-    for begin, end in edges.reshape(-1, 2):
-        ends = time_s[max(begin - 1, 0)], time_s[min(end, len(time_s) - 1)]
-        ax.axvspan(*ends, facecolor="none", edgecolor=LIGHT_GREY, hatch="////", lw=0.0, label=label)
-        label = "_"
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~present, [False]]).astype(np.int8))).reshape(-1, 2)
+    begin_s, end_s = time_s[np.maximum(edges[:, 0] - 1, 0)], time_s[np.minimum(edges[:, 1], len(time_s) - 1)]
+    # A patch of its own for each of thousands of gaps takes minutes: gaps below a pixel are left out, the rest is one.
+    seen = end_s - begin_s > np.ptp(time_s) / _PIXELS
+    if seen.any():
+        spans = np.column_stack([begin_s, end_s - begin_s])[seen].tolist()
+        style: dict[str, Any] = {"facecolor": "none", "edgecolor": LIGHT_GREY, "hatch": "////", "lw": 0.0}
+        ax.broken_barh(spans, (0.0, 1.0), transform=ax.get_xaxis_transform(), label=label, **style)
 
 
 def truth_columns(truth_m: FloatArray) -> dict[str, Column]:

@@ -331,10 +331,12 @@ class TestTrack:
         figure = track_figure(points)
         for name, sigma, centre in (("y [m]", 0.1, 3.0), ("z [m]", 0.3, -1.0)):
             ax = next(ax for ax in figure.axes if ax.get_ylabel() == name and ax.get_xlabel() == "time [s]")
-            heights = ax.collections[0].get_datalim(ax.transData).intervaly
+            (gaps,) = (drawn for drawn in ax.collections if drawn.get_hatch())
+            band = next(drawn for drawn in ax.collections if not drawn.get_hatch())
+            heights = band.get_datalim(ax.transData).intervaly
             np.testing.assert_allclose(heights, centre + norm.ppf([0.025, 0.975]) * sigma)
-            spans = [(patch.get_x(), patch.get_x() + patch.get_width()) for patch in ax.patches]
-            assert spans == [(0.0, 0.5), (2.0, 3.5)]
+            spans = [path.get_extents().intervalx.tolist() for path in gaps.get_paths()]
+            assert spans == [[0.0, 0.5], [2.0, 3.5]]
 
     def test_moment_band_is_along_the_moment(self) -> None:
         """Moment (0, 3, 4)/5 with variances (4, 1, 9): the modulus has the variance 0.36 + 0.64 · 9."""
@@ -541,3 +543,16 @@ def test_a_notebook_shows_a_figure_without_pyplot() -> None:
 def test_colours_of_an_animation_are_256_of_three_bytes():
     assert len(_palette()) == 3 * 256
     assert (min(_palette()), max(_palette())) == (0, 255)
+
+
+def test_thousands_of_gaps_are_one_patch() -> None:
+    """Gaps of 1 and of 400 s in 20,000 s: the long one is drawn, and the axis of the values keeps its limits."""
+    time_s, ax = np.arange(20_000.0), Figure().subplots()
+    present = time_s % 10.0 != 0.0
+    present[5000:5400] = False
+    ax.plot(time_s, np.sin(time_s / 1000.0))
+    limits = ax.get_ylim()
+    style.shade_gaps(ax, time_s, present, "gap")
+    (drawn,) = ax.collections
+    assert [path.get_extents().intervalx.tolist() for path in drawn.get_paths()] == [[4999.0, 5401.0]]
+    assert ax.get_ylim() == limits
