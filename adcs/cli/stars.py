@@ -38,6 +38,7 @@ def stars(
     dark: Path | None = None,
     near: tuple[float, float, float] | None = None,
     wcs: Path | None = None,
+    lens: Path | None = None,
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
@@ -58,7 +59,7 @@ def stars(
         Standard deviation of a star's position, per axis [px]; 1 in frames, 0.5 in photographs by default. At most a
         tenth of the image's shorter side.
     scale_arcsec : float, optional
-        Size of a pixel at the centre [arcsec]. Without it the command tries fields of 3 to 45° for photographs.
+        Size of a pixel at the centre [arcsec]. Without it the command tries fields of 3 to 100° for photographs.
     scale_tolerance : float, optional
         Relative error of the scale, at most 0.1; by default 0.05 for photographs, 0 for frames.
     year : float
@@ -73,6 +74,9 @@ def stars(
         search fast. A centre outside the radius is not found.
     wcs : Path, optional
         Folder for a FITS header with the world coordinates of each solved photograph, NAME.wcs.
+    lens : Path, optional
+        TOML file with the lens of the camera, in place of --scale-arcsec. If it does not exist, it is written, with the
+        lens of the photograph with most stars.
     report : ReportOptions
         Outputs.
     """
@@ -87,6 +91,8 @@ def stars(
     if not images:
         raise InputError("IMAGES: found none, expected photographs, or a folder of frames.")
     of_pictures = images[0].suffix.lower() in SUFFIXES
+    if lens is not None and scale_arcsec is not None and lens.exists():
+        raise InputError(f"--scale-arcsec: found together with the lens {lens}, expected one of them.")
     if len(images) > 1 and not of_pictures:
         raise InputError(f"{images[1]}: found more than one folder of frames, expected one.")
     known = hipparcos_catalogue(year) if str(catalogue) == "hipparcos" else read_star_catalogue(catalogue)
@@ -98,9 +104,10 @@ def stars(
     rad_per_px = None if scale_arcsec is None else math.radians(scale_arcsec / 3600.0)
     hint = _cap(near)
     if of_pictures:
-        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, hint, dark, report, wcs)
-    elif wcs is not None:
-        raise InputError(f"--wcs {wcs}: found a folder of frames, expected photographs.")
+        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, hint, dark, report, wcs, lens)
+    elif wcs is not None or lens is not None:
+        named = f"--lens {lens}" if wcs is None else f"--wcs {wcs}"
+        raise InputError(f"{named}: found a folder of frames, expected photographs.")
     else:
         _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, hint, report)
 
@@ -133,40 +140,53 @@ def _pictures(
     dark: Path | None,
     report: ReportOptions,
     wcs: Path | None,
+    lens: Path | None,
 ) -> None:
     from adcs.plots.stars import picture_figure
     from adcs.stars.identification import NoFix
+    from adcs.stars.lens import lens_text, read_lens
     from adcs.stars.wcs import wcs_header
     from arrays.io.outputs import refuse_file, write_files
 
     report.check()
+    known_lens = read_lens(lens) if lens is not None and lens.exists() else None
     refuse_file(wcs, "--wcs")
     off = None if dark is None else adcs.read_picture(dark)
     rows, solved = [], []
     for path in paths:
         picture = adcs.read_picture(path)
+        if known_lens is not None:
+            known_lens.check(path, picture.shape)
         began = time.perf_counter()
         with naming(str(path)):
             lights, found = adcs.solve_photograph(
-                picture, known, rad_per_px=rad_per_px, tolerance=tolerance, noise_px=noise_px, near=near, dark=off
+                picture,
+                known,
+                rad_per_px=rad_per_px,
+                tolerance=tolerance,
+                noise_px=noise_px,
+                near=near,
+                lens=known_lens,
+                dark=off,
             )
         took_ms = 1e3 * (time.perf_counter() - began)
         row: dict[str, Any] = {"file": str(path), "solved": not isinstance(found, NoFix)}
         if isinstance(found, NoFix):
             row |= dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "scale_arcsec", "scale_sigma_arcsec"))
-            row |= dict.fromkeys(("corner_px", "corner_sigma_px", "field_deg"))
+            row |= dict.fromkeys(("corner_px", "corner_sigma_px", "lens", "field_deg"))
             row |= {"mirrored": None, "matched": 0, "residual_arcsec": None, "reason": found.reason}
         else:
             row |= _direction(found.R_catalogue_from_frame)
             camera, sigma = found.pose.camera, np.sqrt(np.diag(found.pose.covariance))
-            width = math.atan(0.5 * picture.shape[1] * math.tan(camera.rad_per_px))
+            sides = camera.directions([[0.0, 0.5 * camera.height_px], [camera.width_px, 0.5 * camera.height_px]])
             half_diagonal_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
             row |= {
                 "scale_arcsec": _arcsec(camera.rad_per_px),
                 "scale_sigma_arcsec": _arcsec(camera.rad_per_px * sigma[3]),
                 "corner_px": camera.corner_shift_px,
                 "corner_sigma_px": sigma[4] * camera.corner**2 * half_diagonal_px,
-                "field_deg": math.degrees(2.0 * width),
+                "lens": camera.projection,
+                "field_deg": math.degrees(math.acos(sides[0] @ sides[1])),
                 "mirrored": found.mirrored,
                 "matched": len(found.stars),
                 "residual_arcsec": _arcsec(found.rms_rad),
@@ -182,6 +202,10 @@ def _pictures(
     headers = [(f"{path.stem}.wcs", wcs_header(fix)) for path, _, _, fix in solved if fix is not None]
     if headers:
         write_files(wcs, headers, "--wcs")
+    fixes = [fix for *_, fix in solved if fix is not None]
+    if lens is not None and known_lens is None and fixes:
+        best = max(fixes, key=lambda fix: len(fix.stars))
+        write_files(lens.parent, [(lens.name, lens_text(best.pose))], "--lens")
     report.print({"pictures": rows}, [_picture_line(row) for row in rows])
 
 
@@ -197,10 +221,11 @@ def _picture_line(row: dict[str, Any]) -> str:
     """Return the text of one photograph."""
     if not row["solved"]:
         return f"{row['file']}: no fix, {row['reason']}"
+    kind = "equidistant lens, " if row["lens"] == "equidistant" else ""
     return (
         f"{row['file']}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
         f"{row['scale_arcsec']:.3f} ± {row['scale_sigma_arcsec']:.3f} arcsec/px, {row['field_deg']:.2f}° wide, "
-        f"corners bent by {row['corner_px']:+.1f} ± {row['corner_sigma_px']:.1f} px; "
+        f"{kind}corners bent by {row['corner_px']:+.1f} ± {row['corner_sigma_px']:.1f} px; "
         f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms{_mirror_note(row)}"
     )
 

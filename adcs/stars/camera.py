@@ -1,9 +1,10 @@
-"""Star camera: a pinhole with the radial distortion of its lens."""
+"""Star camera: a pinhole or equidistant lens with radial distortion."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,17 +12,22 @@ from numpy.typing import ArrayLike
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
+Projection = Literal["pinhole", "equidistant"]
+
 MOST_PIXELS = 100_000
 """Largest number of pixels of either side of an image."""
 SCALE_ARCSEC = (0.01, 3600.0)
 """Range of a pixel's size, from the largest telescopes to one degree."""
+_MOST_ANGLE_RAD = math.radians(89.0)
 WIDEST_RAD = math.radians(150.0)
-"""Largest angle between opposite corners; no pinhole lens shows more."""
+"""Largest angle between opposite corners; tangents of more are useless."""
 
 
 @dataclass(frozen=True)
 class StarCamera:
-    """Pinhole camera with a lens: tangents s = tan(rad_per_px) x, distorted to s (1 + radial |s|²).
+    """Camera with a lens: places s = tan(rad_per_px) x, distorted to q = s (1 + radial |s|²).
+
+    The length of q is the tangent of the angle from the axis for a pinhole, and the angle for an equidistant lens.
 
     Attributes
     ----------
@@ -30,7 +36,9 @@ class StarCamera:
     rad_per_px : float
         Scale at the centre.
     radial : float
-        Distortion; if positive, a star is nearer to the centre than with a pinhole.
+        Distortion; if positive, a star is nearer to the centre than without it.
+    projection : str
+        "pinhole" or "equidistant".
 
     Raises
     ------
@@ -42,6 +50,7 @@ class StarCamera:
     height_px: int
     rad_per_px: float
     radial: float = 0.0
+    projection: Projection = "pinhole"
 
     def __post_init__(self) -> None:
         check_positive(width_px=self.width_px, height_px=self.height_px, rad_per_px=self.rad_per_px)
@@ -63,7 +72,7 @@ class StarCamera:
     @property
     def diagonal_rad(self) -> float:
         """Angle between opposite corners of the image."""
-        return 2.0 * math.atan(self.corner)
+        return 2.0 * (self.corner if self.projection == "equidistant" else math.atan(self.corner))
 
     @property
     def solid_angle_sr(self) -> float:
@@ -72,7 +81,7 @@ class StarCamera:
 
     @property
     def corner(self) -> float:
-        """Tangent of the angle between a corner and the centre, without distortion."""
+        """Place |s| of a corner: tangent of its angle from the centre, or the angle, without distortion."""
         return 0.5 * math.hypot(self.width_px, self.height_px) * math.tan(self.rad_per_px)
 
     @property
@@ -96,9 +105,29 @@ class StarCamera:
             raise ValueError(
                 f"Input points_px must be finite numbers of shape (f, 2); instead received shape {points.shape}."
             )
-        pinhole = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
-        bent: FloatArray = pinhole * (1.0 + self.radial * np.sum(pinhole**2, axis=1, keepdims=True))
+        places = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
+        bent: FloatArray = places * (1.0 + self.radial * np.sum(places**2, axis=1, keepdims=True))
+        if self.projection == "equidistant":
+            # Distortions far outside the picture must not turn a star to behind the camera.
+            angle = np.minimum(np.linalg.norm(bent, axis=1, keepdims=True), _MOST_ANGLE_RAD)
+            bent = bent * np.tan(angle) / np.maximum(np.linalg.norm(bent, axis=1, keepdims=True), 1e-300)
         return bent
+
+    def places(self, tangents: FloatArray) -> FloatArray:
+        """Return the distorted places q (f, 2) of tangents (f, 2)."""
+        if self.projection == "pinhole":
+            return tangents
+        length = np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
+        return np.asarray(tangents * np.arctan(length) / length)
+
+    def place_changes(self, tangents: FloatArray, changes: FloatArray) -> FloatArray:
+        """Return the changes (f, 2, n) of the places q by changes (f, 2, n) of tangents (f, 2)."""
+        if self.projection == "pinhole":
+            return changes
+        length = np.maximum(np.linalg.norm(tangents, axis=1), 1e-12)[:, None, None]
+        outward = tangents[:, :, None] / length
+        along = outward * np.sum(outward * changes, axis=1, keepdims=True)
+        return np.asarray((changes - along) * np.arctan(length) / length + along / (1.0 + length**2))
 
     def directions(self, points_px: ArrayLike) -> FloatArray:
         """Return unit vectors (f, 3) in the camera frame of points (f, 2).
@@ -108,3 +137,12 @@ class StarCamera:
         tangents = self.tangents(points_px)
         outward = np.concatenate([tangents, np.full((len(tangents), 1), -1.0)], axis=1)
         return outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+
+def as_projection(camera: StarCamera, projection: Projection) -> StarCamera:
+    """Return a camera with another projection that shows the same up to the third power of the angle."""
+    if projection == camera.projection:
+        return camera
+    # atan t = t - t³/3 + …
+    cube = 1.0 / 3.0 if camera.projection == "equidistant" else -1.0 / 3.0
+    return replace(camera, projection=projection, radial=camera.radial + cube)

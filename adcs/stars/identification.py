@@ -9,12 +9,13 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import binom
 
-from adcs.stars.camera import StarCamera
+from adcs.stars.camera import Projection, StarCamera, as_projection
 from adcs.stars.catalogue import WHOLE_SKY, SkyCap, StarCatalogue
 from adcs.stars.pose import CameraPose, LensPrior, fit_pose
 from adcs.stars.triangles import AttitudeHypothesis, Checks, RankedTriangles, TriangleIndex, star_triangles
@@ -33,6 +34,8 @@ _ROUNDS = 3  # largest number of groups of hypotheses that are fitted
 _CROWDED = 4.0  # largest density of stars over the mean
 _WIDENED = 2.0  # gate of a hypothesis from three noisy stars over the usual one
 _REFITS = 6
+# Gates over the usual one of a wide field, whose lens may bend the corners; its prior.
+_NARROWING, _STRONG_LENS = (2.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0), LensPrior(scale=0.1, bent=0.1)
 # Numbers of the brightest lights whose match is tested: in a picture only the brightest may be stars.
 _BEGINNINGS = (15, 30, 60, 100)
 _COMPANIONS = 3  # largest number of catalogue stars within the noise of one place
@@ -190,7 +193,10 @@ class StarMatcher:
         found = self.index.best(tangents[order], image, self.catalogue.cells, checks)
         reason = "no triangle of the image is in the catalogue"
         for hypotheses in islice(found, _ROUNDS):
-            fixes = [self._fit(points, brightness[order], hypothesis, prior) for hypothesis in hypotheses]
+            fixes = [
+                self._fit(points, brightness[order], self._pose(hypothesis), prior, hypothesis.tried)
+                for hypothesis in hypotheses
+            ]
             best = min(fixes, key=lambda fix: fix.log10_chance)
             if best.log10_chance <= math.log10(self.most_chance):
                 if not self.near.contains(-best.R_catalogue_from_frame[:, 2]):
@@ -217,30 +223,59 @@ class StarMatcher:
         enough = int(np.count_nonzero(chance > math.log(0.01 * self.most_chance)))
         return Checks(4.0 * self.noise_px * self.camera.rad_per_px, prior.scale, near, stars, enough, _MOST_HYPOTHESES)
 
-    def _fit(
-        self, points: FloatArray, magnitudes: FloatArray, hypothesis: AttitudeHypothesis, prior: LensPrior
-    ) -> StarFix:
-        """Fit the pose to all stars near their places, with the probability of as many by chance."""
+    def _pose(self, hypothesis: AttitudeHypothesis) -> CameraPose:
+        """Return the pose of a hypothesis, without a covariance."""
         rad_per_px = math.atan(hypothesis.scale * math.tan(self.camera.rad_per_px))
-        pose = CameraPose(hypothesis.R, replace(self.camera, rad_per_px=rad_per_px), np.zeros((5, 5)))
-        widened, before = _WIDENED, np.empty(0, dtype=np.intp)
-        for _ in range(_REFITS):
+        return CameraPose(hypothesis.R, replace(self.camera, rad_per_px=rad_per_px), np.zeros((5, 5)))
+
+    def refine_lens(self, points_px: FloatArray, magnitudes: FloatArray, fix: StarFix) -> StarFix:
+        """Fit the lens of a wide field to more stars, as a pinhole and as an equidistant lens; the better one.
+
+        ``points_px`` (f, 2), ``magnitudes`` (f,): stars of the fix, brightest first. The gate narrows in steps, because
+        the first fit may miss the stars in the corners.
+        """
+        points = points_px * [-1.0, 1.0] + [self.camera.width_px, 0.0] if fix.mirrored else points_px
+        best = fix
+        for projection in get_args(Projection):
+            start = replace(fix.pose, camera=as_projection(fix.pose.camera, projection))
+            lens = replace(self, camera=replace(self.camera, projection=projection))
+            found = lens._fit(points, magnitudes, start, _STRONG_LENS, 1, _NARROWING)
+            if (len(found.stars), -found.rms_rad) > (len(best.stars), -best.rms_rad):
+                best = found
+        rows = best.stars if best is fix else np.stack([best.stars[:, 0], self.rows[best.stars[:, 1]]], axis=1)
+        return replace(best, stars=rows, log10_chance=fix.log10_chance, mirrored=fix.mirrored)
+
+    def _fit(
+        self,
+        points: FloatArray,
+        magnitudes: FloatArray,
+        pose: CameraPose,
+        prior: LensPrior,
+        tried: int,
+        gates: tuple[float, ...] = (_WIDENED,),
+    ) -> StarFix:
+        """Fit the pose to all stars near their places, with the probability of as many by chance.
+
+        ``gates``: those of the first fits, over the usual one.
+        """
+        before = np.empty(0, dtype=np.intp)
+        for i in range(len(gates) + _REFITS - 1):
             directions = pose.camera.directions(points) @ pose.R_catalogue_from_frame.T
-            gate = widened * self.gate_rad(pose.camera)
+            gate = (gates[i] if i < len(gates) else 1.0) * self.gate_rad(pose.camera)
             row = np.asarray(self.catalogue.tree.query(directions, distance_upper_bound=gate)[1], dtype=np.intp)
             near = row < len(self.catalogue.numbers)
-            if np.count_nonzero(near) < 3 or np.array_equal(row, before):
+            if np.count_nonzero(near) < 3 or (i >= len(gates) and np.array_equal(row, before)):
                 break
             there = self.catalogue.directions[row[near]]
             pose = fit_pose(points[near], there, pose, self.camera, prior, self.noise_px)
-            widened, before = 1.0, row
+            before = row
         directions = pose.camera.directions(points) @ pose.R_catalogue_from_frame.T
         stars = self._match(directions, magnitudes, self.gate_rad(pose.camera))
         off = directions[stars[:, 0]] - self.catalogue.directions[stars[:, 1]]
         rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(stars) else math.inf
         sizes = np.unique(np.minimum((*_BEGINNINGS, len(points)), len(points)))
         chance = self._log_chance(pose, np.searchsorted(stars[:, 0], sizes), sizes).min()
-        chance = (float(chance) + math.log(hypothesis.tried * len(sizes))) / math.log(10.0)
+        chance = (float(chance) + math.log(tried * len(sizes))) / math.log(10.0)
         return StarFix(stars, rms, chance, pose)
 
     def _match(self, directions: FloatArray, magnitudes: FloatArray, gate: float) -> IntArray:

@@ -51,20 +51,22 @@ def fit_pose(
     """Refine a pose by one Gauss–Newton step, from stars (k, 2) and directions (k, 3) in the catalogue.
 
     A star at v = Rᵀd has the tangents t = (v₁, v₂) / −v₃. A rotation δθ about the frame's axes moves it by v × δθ.
-    Without noise, t equals a x (1 + κ a²|x|²) of the star's point x. The covariance uses the scatter of the residuals.
+    Without noise, the camera's place of t equals a x (1 + κ a²|x|²) of the star's point x. The covariance uses the
+    scatter of the residuals.
     """
     v = there @ pose.R_catalogue_from_frame
-    pinhole = replace(pose.camera, radial=0.0).tangents(points_px)
+    pinhole = replace(pose.camera, radial=0.0, projection="pinhole").tangents(points_px)
     squared = np.sum(pinhole**2, axis=1, keepdims=True)
     seen = pinhole * (1.0 + pose.camera.radial * squared)
     t = v[:, :2] / -v[:, 2:]
     dv = np.cross(v[:, None], np.eye(3))
     J = np.empty((len(v), 2, 5))
-    J[..., :3] = np.swapaxes(dv[..., :2] / -v[:, None, 2:] + dv[..., 2:] * (v[:, None, :2] / v[:, None, 2:] ** 2), 1, 2)
+    dt = np.swapaxes(dv[..., :2] / -v[:, None, 2:] + dv[..., 2:] * (v[:, None, :2] / v[:, None, 2:] ** 2), 1, 2)
+    J[..., :3] = pose.camera.place_changes(t, dt)
     J[..., 3] = -pinhole * (1.0 + 3.0 * pose.camera.radial * squared)
     J[..., 4] = -pinhole * squared
     J = J.reshape(-1, 5) / math.tan(pose.camera.rad_per_px)
-    left = (seen - t).ravel() / math.tan(pose.camera.rad_per_px)
+    left = (seen - pose.camera.places(t)).ravel() / math.tan(pose.camera.rad_per_px)
     sigma = np.array([math.inf, math.inf, math.inf, prior.scale, prior.bent / known.corner**2])
     off = np.array([0.0, 0.0, 0.0, math.log(pose.camera.rad_per_px / known.rad_per_px), 0.0])
     off[4] = pose.camera.radial - known.radial

@@ -13,17 +13,21 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adcs.stars.camera import WIDEST_RAD, StarCamera
+from adcs.stars.camera import StarCamera
 from adcs.stars.catalogue import WHOLE_SKY, SkyCap, StarCatalogue
 from adcs.stars.identification import NoFix, StarFix, StarMatcher, ranked_triangles
+from adcs.stars.lens import KnownLens
 from adcs.stars.pictures import LEAST_PX, PictureStars, find_picture_stars
-from adcs.stars.pose import UNKNOWN_LENS
+from adcs.stars.pose import UNKNOWN_LENS, LensPrior
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
+_STRONG_RAD = math.radians(25.0)  # field of view from which on a lens may bend the corners strongly
 _STARS = 100  # number of the brightest lights in use; the catalogue has no fainter stars
 _WIDEST_TOLERANCE = 0.1
 _FIRST_FIELD_RAD, _LAST_FIELD_RAD = math.radians(3.0), math.radians(45.0)
+# Fields from corner to corner of equidistant lenses; the angles of a lens do not scale as those of another one.
+_FIRST_WIDE_RAD, _LAST_WIDE_RAD, _WIDE_FIELDS = math.radians(45.0), math.radians(100.0), 9
 
 
 def solve_photograph(
@@ -34,6 +38,7 @@ def solve_photograph(
     tolerance: float = 0.05,
     noise_px: float = 0.5,
     near: SkyCap = WHOLE_SKY,
+    lens: KnownLens | None = None,
     dark: ArrayLike | None = None,
 ) -> tuple[PictureStars, StarFix | NoFix]:
     """Identify attitude, scale and stars of a photograph of the sky.
@@ -45,7 +50,8 @@ def solve_photograph(
     catalogue : StarCatalogue
         Catalogue, such as :func:`adcs.hipparcos_catalogue`.
     rad_per_px : float, optional
-        Scale at the centre; by default fields of 3 to 45° from corner to corner are tried.
+        Scale at the centre; by default fields of 3 to 45° from corner to corner are tried, and
+        of 45 to 100° with an equidistant lens.
     tolerance : float
         Relative error of that scale, at most 0.1.
     noise_px : float
@@ -53,6 +59,8 @@ def solve_photograph(
     near : SkyCap
         Part of the sky in which the picture's centre is, such as ``adcs.stars.catalogue.SkyCap.of(ra_rad, dec_rad,
         radius_rad)``; by default the whole sky.
+    lens : KnownLens, optional
+        Lens of the camera, such as from ``adcs.stars.lens.read_lens``, in place of ``rad_per_px``.
     dark : array_like, shape (height, width), optional
         Picture of the camera without light, which is subtracted.
 
@@ -93,6 +101,7 @@ def solve_photograph(
         tolerance=tolerance,
         noise_px=noise_px,
         near=near,
+        lens=lens,
     )
     return stars, found
 
@@ -108,12 +117,14 @@ def identify_at_unknown_scale(
     tolerance: float = 0.05,
     noise_px: float = 0.5,
     near: SkyCap = WHOLE_SKY,
+    lens: KnownLens | None = None,
 ) -> StarFix | NoFix:
     """Identify attitude, scale and stars of a picture.
 
     ``rad_per_px``: scale at the centre with the relative error ``tolerance``, at most 0.1; by default fields of 3 to
-    45° from corner to corner are tried. ``noise_px``: standard deviation of a star's place, with errors of the lens.
-    ``near``: part of the sky in which the picture's centre is.
+    100° from corner to corner are tried, the widest with an equidistant lens. ``noise_px``: standard deviation of a
+    star's place, with errors of the lens. ``near``: part of the sky in which the picture's centre is. ``lens``: known
+    lens, in place of ``rad_per_px``.
     """
     check_positive(tolerance=tolerance, noise_px=noise_px)
     if tolerance > _WIDEST_TOLERANCE:
@@ -122,32 +133,50 @@ def identify_at_unknown_scale(
     points, magnitudes = points_px[brightest], magnitudes[brightest]
     if len(points) < 4:
         return NoFix(f"{len(points)} stars, 4 needed")
-    scales, within = _scales(math.hypot(width_px, height_px), rad_per_px, tolerance)
+    if lens is not None:
+        cameras, prior = [lens.camera], lens.prior
+    else:
+        cameras, prior = _cameras(width_px, height_px, rad_per_px, tolerance)
     ranked = ranked_triangles(catalogue)
 
     @cache
-    def matcher_of(scale: float) -> StarMatcher:
-        return StarMatcher.of(catalogue, StarCamera(width_px, height_px, scale), noise_px, near, ranked)
+    def matcher_of(camera: StarCamera) -> StarMatcher:
+        return StarMatcher.of(catalogue, camera, noise_px, near, ranked)
 
-    for mirrored, scale in product((False, True), scales):
-        matcher = matcher_of(scale)
-        fix = matcher.identify(points, magnitudes, replace(UNKNOWN_LENS, scale=within), mirrored=mirrored)
-        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(scales)):
+    for mirrored, camera in product((False, True), cameras):
+        fix = matcher_of(camera).identify(points, magnitudes, prior, mirrored=mirrored)
+        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(cameras)):
+            if lens is None and camera.diagonal_rad > _STRONG_RAD:
+                fix = matcher_of(camera).refine_lens(points, magnitudes, fix)
             return replace(fix, stars=np.stack([brightest[fix.stars[:, 0]], fix.stars[:, 1]], axis=1))
     where = "" if near.share >= 1.0 else f"not solved near {near}: "
-    return NoFix(f"{where}no scale of {len(scales)} explains the {len(points)} brightest lights, mirrored or not")
+    return NoFix(f"{where}no scale of {len(cameras)} explains the {len(points)} brightest lights, mirrored or not")
 
 
-def _scales(diagonal_px: float, rad_per_px: float | None, tolerance: float) -> tuple[list[float], float]:
-    """Return the scales to try, and their relative error."""
+def _cameras(
+    width_px: int, height_px: int, rad_per_px: float | None, tolerance: float
+) -> tuple[list[StarCamera], LensPrior]:
+    """Return the cameras to try, and the prior of their lens."""
     if rad_per_px is not None:
-        return [rad_per_px], tolerance
+        camera = StarCamera(width_px, height_px, rad_per_px)
+        kinds = [camera] if camera.diagonal_rad < _FIRST_WIDE_RAD else [camera, _equidistant(camera)]
+        return kinds, replace(UNKNOWN_LENS, scale=tolerance)
     step = (1.0 + _WIDEST_TOLERANCE) / (1.0 - _WIDEST_TOLERANCE)
     n = math.ceil(math.log(_LAST_FIELD_RAD / _FIRST_FIELD_RAD) / math.log(step))
     fields = _FIRST_FIELD_RAD * step ** np.arange(n + 1)
     # Fields near ten degrees come first, as most star cameras have them. The narrowest need the most triangles.
     from_usual = np.log(fields / math.radians(10.0))
-    fields = fields[np.argsort(np.where(from_usual < -0.3, 10.0 - from_usual, np.abs(from_usual)))]
-    return [
-        math.atan(2.0 * math.tan(0.5 * min(field, WIDEST_RAD)) / diagonal_px) for field in fields
-    ], _WIDEST_TOLERANCE
+    fields = fields[np.argsort(np.where(from_usual < -0.1, 10.0 - from_usual, from_usual))]
+    diagonal_px = math.hypot(width_px, height_px)
+    cameras = [StarCamera(width_px, height_px, math.atan(2.0 * math.tan(0.5 * f) / diagonal_px)) for f in fields]
+    narrow = int(np.count_nonzero(from_usual < -0.3))  # beyond these, after the wide ones
+    wide = [
+        _equidistant(StarCamera(width_px, height_px, math.atan(f / diagonal_px)))
+        for f in np.geomspace(_FIRST_WIDE_RAD, _LAST_WIDE_RAD, _WIDE_FIELDS)
+    ]
+    ordered = [*cameras[: len(cameras) - narrow], *wide, *cameras[len(cameras) - narrow :]]
+    return ordered, replace(UNKNOWN_LENS, scale=_WIDEST_TOLERANCE)
+
+
+def _equidistant(camera: StarCamera) -> StarCamera:
+    return replace(camera, projection="equidistant")

@@ -1,7 +1,8 @@
 """World coordinates of a solved photograph as a FITS header.
 
-The header maps pixels to the sky by the gnomonic projection TAN, with the radial distortion of the lens as polynomials
-of the convention SIP. By FITS, the centre of the first pixel is (1, 1), and the first row is at the bottom.
+The header of a pinhole has the gnomonic projection TAN, with the radial distortion as polynomials of the convention
+SIP. That of an equidistant lens has the zenithal polynomial projection ZPN. By FITS, the centre of the first pixel is
+(1, 1), and the first row is at the bottom.
 
 Sources: Calabretta and Greisen, Representations of celestial coordinates in FITS, 2002; Shupe et al., The SIP
 convention for representing distortion in FITS image headers, 2005.
@@ -13,17 +14,19 @@ import math
 
 import numpy as np
 
+from adcs.stars.camera import StarCamera
 from adcs.stars.identification import StarFix
 from arrays.typing import FloatArray
 
 _CARD, _BLOCK = 80, 2880
+_ZPN_POWERS = 20  # limit of the powers of a polynomial by the standard
 
 
 def wcs_header(fix: StarFix) -> str:
     """Return the FITS header of the world coordinates of a solved photograph.
 
     The frame is that of the catalogue, for Hipparcos the ICRS. The projection is TAN without, and TAN-SIP with a
-    distortion of the lens. In a mirrored picture x is that of the file.
+    distortion of a pinhole, ZPN for an equidistant lens. In a mirrored picture x is that of the file.
     """
     camera, R = fix.pose.camera, fix.R_catalogue_from_frame
     scale = math.tan(camera.rad_per_px)
@@ -31,14 +34,17 @@ def wcs_header(fix: StarFix) -> str:
     axis = -R[:, 2]
     cards: dict[str, str | int | float | bool] = {"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "WCSAXES": 2}
     bent = camera.radial * scale**2
-    suffix = "TAN-SIP" if bent else "TAN"
+    equidistant = camera.projection == "equidistant"
+    suffix = "ZPN" if equidistant else "TAN-SIP" if bent else "TAN"
     cards |= {"CTYPE1": f"RA---{suffix}", "CTYPE2": f"DEC--{suffix}", "CUNIT1": "deg", "CUNIT2": "deg"}
     cards |= {"CRVAL1": math.degrees(math.atan2(axis[1], axis[0])) % 360.0}
     cards |= {"CRVAL2": math.degrees(math.asin(min(max(float(axis[2]), -1.0), 1.0)))}
     cards |= {"CRPIX1": 0.5 * camera.width_px + 0.5, "CRPIX2": 0.5 * camera.height_px + 0.5}
     cards |= {f"CD{i + 1}_{j + 1}": float(degrees[i, j]) for i in range(2) for j in range(2)}
     cards |= {"LONPOLE": 180.0, "RADESYS": "ICRS", "IMAGEW": camera.width_px, "IMAGEH": camera.height_px}
-    if bent:
+    if equidistant:
+        cards |= {f"PV2_{m}": value for m, value in _places_of_angles(camera).items()}
+    elif bent:
         cards |= {"A_ORDER": 3, "B_ORDER": 3, "A_3_0": bent, "A_1_2": bent, "B_0_3": bent, "B_2_1": bent}
     text = "".join(_card(name, value) for name, value in cards.items()) + "END".ljust(_CARD)
     return text.ljust(-(-len(text) // _BLOCK) * _BLOCK)
@@ -51,6 +57,15 @@ def _plane_from_frame(R: FloatArray) -> FloatArray:
     east = np.array([-math.sin(ra), math.cos(ra), 0.0])
     north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
     return np.stack([east, north]) @ R[:, :2]
+
+
+def _places_of_angles(camera: StarCamera) -> dict[int, float]:
+    """Return the coefficients of ζ, ζ³, … of the place s at the angle ζ = s (1 + radial s²) from the axis."""
+    place = np.linspace(0.0, 1.02 * camera.corner, 400)[1:]
+    angle = place * (1.0 + camera.radial * place**2)
+    powers = np.arange(1, _ZPN_POWERS, 2)
+    fitted = np.linalg.lstsq((angle / angle[-1])[:, None] ** powers, place, rcond=None)[0]
+    return {int(m): float(value / angle[-1] ** m) for m, value in zip(powers, fitted, strict=True)}
 
 
 def _card(name: str, value: str | float | bool) -> str:

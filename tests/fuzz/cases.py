@@ -130,6 +130,7 @@ LINES: dict[str, tuple[str, ...]] = {
     "adcs stars": (
         "frames --catalogue stars.csv --json",
         "sky.png --catalogue stars.csv --scale-arcsec 15.8 --near 40 20 5 --wcs out --json",
+        "sky.png --catalogue stars.csv --lens lens.toml --json",
     ),
 }  # fmt: skip
 _OF_GROUND = ("time_s", "array_x_m", "array_y_m", "array_z_m", "m_nT")
@@ -396,4 +397,6 @@ def _write_stars(folder: Path) -> None:
     (folder / "stars.csv").write_text("hip,ra_deg,dec_deg,mag\n" + "".join(lines))
     dark = np.random.default_rng(0).normal(20.0, 3.0, (128, 128))
     Image.fromarray(dark.astype(np.uint8)).save(folder / "sky.png")
+    lens = 'projection = "pinhole"\nwidth_px = 128\nheight_px = 128\nscale_arcsec = 15.8\nradial = 0.1\n'
+    (folder / "lens.toml").write_text(lens + "scale_sigma_arcsec = 0.01\nradial_sigma = 0.01\n")
     write_frames(folder / "frames", sky, Rotation.random(2, random_state=1).as_matrix(), np.random.default_rng(2))

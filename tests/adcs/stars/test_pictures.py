@@ -1,5 +1,6 @@
 """Photographs: files of 8 and 16 bits, lights on a glowing sky, and where a picture looks without its scale."""
 
+import csv
 import json
 import math
 import re
@@ -290,6 +291,69 @@ class TestHipparcos:
         scale = 40.3 if name.startswith("esa") else 15.73
         assert row["scale_arcsec"] == pytest.approx(scale, rel=2e-3)
         assert (tmp_path / f"{Path(name).stem}-stars.png").stat().st_size > 10_000
+
+
+def rays(points, camera, projection, radial):
+    """Unit vectors of points (n, 2): q = s (1 + radial s²) is the tangent or the angle from the axis."""
+    s = (points - 0.5 * np.array([camera.width_px, camera.height_px])) * math.tan(camera.rad_per_px)
+    q = np.linalg.norm(s, axis=1) * (1.0 + radial * np.sum(s**2, axis=1))
+    angle = np.arctan(q) if projection == "pinhole" else q
+    across = s / np.linalg.norm(s, axis=1)[:, None] * np.sin(angle)[:, None]
+    return np.concatenate([across, -np.cos(angle)[:, None]], axis=1)
+
+
+def wide_photograph(sky, R, camera, projection, radial, rng):
+    """A picture of 16 bits as in `photograph`; the pixel of each star by interpolation of the lens's own law."""
+    seen = sky.directions @ R
+    angle = np.arccos(np.clip(-seen[:, 2], -1.0, 1.0))
+    s = np.linspace(0.0, camera.corner * 1.1, 20_000)
+    q = s * (1.0 + radial * s**2)
+    reach = np.interp(angle, np.arctan(q) if projection == "pinhole" else q, s, right=np.nan) / math.tan(
+        camera.rad_per_px
+    )
+    points = seen[:, :2] / np.linalg.norm(seen[:, :2], axis=1)[:, None] * reach[:, None]
+    points += 0.5 * np.array([camera.width_px, camera.height_px])
+    picture = 2000.0 + 20.0 * rng.standard_normal((camera.height_px, camera.width_px))
+    y, x = np.mgrid[-8:9, -8:9]
+    for (px, py), magnitude in zip(points, sky.magnitudes, strict=True):
+        if not (8.0 < px < camera.width_px - 8.0 and 8.0 < py < camera.height_px - 8.0):
+            continue
+        i, j = round(camera.height_px - py - 0.5), round(px - 0.5)
+        spot = np.exp(-0.5 * ((y + i - (camera.height_px - py - 0.5)) ** 2 + (x + j - (px - 0.5)) ** 2) / 1.2**2)
+        flux = 20_000.0 * 10.0 ** (-0.4 * (magnitude - 6.0)) / (2.0 * math.pi * 1.2**2)
+        rows, columns = np.clip(y + i, 0, camera.height_px - 1), np.clip(x + j, 0, camera.width_px - 1)
+        picture[rows, columns] += flux * spot
+    return np.clip(np.round(picture), 0, 65_535)
+
+
+class TestWideFields:
+    @pytest.mark.parametrize(
+        ("name", "most_px"),
+        [("wispr-20181101-inner", 0.55), ("wispr-20181101-outer", 0.55), ("wispr-20190405-inner", 0.99)],
+    )
+    def test_space_photographs(self, data_folder, name, most_px):
+        """The centre is that of the spacecraft's star trackers, to 0.3 px, in the 2019 picture to 0.8 px."""
+        folder = data_folder / "star-photographs-space"
+        with (folder / "truth.csv").open() as file:
+            (truth,) = (row for row in csv.DictReader(file) if row["image"] == name)
+        _, found = solve_photograph(read_picture(folder / f"{name}.tiff"), adcs.hipparcos_catalogue(2018.9))
+        axis = direction(float(truth["centre_ra_deg"]), float(truth["centre_dec_deg"]))
+        off_rad = np.linalg.norm(-found.R_catalogue_from_frame[:, 2] - axis)
+        assert off_rad / found.pose.camera.rad_per_px < most_px
+
+    @pytest.mark.parametrize("lens", [("pinhole", 0.15), ("equidistant", 0.05), ("equidistant", -0.15)])
+    def test_a_wide_lens_is_found(self, lens):
+        """Field of 61° from corner to corner, 30 px of distortion in a corner; all pixels to 0.5 px, rms to 0.2."""
+        camera = StarCamera(500, 480, math.radians(0.088))
+        projection, radial = lens
+        sky, R = random_sky(9_000), Rotation.random(random_state=20).as_matrix()
+        picture = wide_photograph(sky, R, camera, projection, radial, np.random.default_rng(20))
+        _, found = solve_photograph(picture, sky)
+        points = np.random.default_rng(1).uniform([20, 20], [480, 460], (100, 2))
+        seen = found.pose.camera.directions(points) @ found.R_catalogue_from_frame.T
+        off_px = np.linalg.norm(seen - rays(points, camera, projection, radial) @ R.T, axis=1) / camera.rad_per_px
+        assert math.sqrt(np.mean(off_px**2)) < 0.2
+        assert off_px.max() < 0.5
 
 
 class TestCommand:

@@ -14,7 +14,7 @@ from adcs.stars.pose import CameraPose
 from adcs.stars.wcs import wcs_header
 from tests.adcs.stars.skies import photograph
 from tests.adcs.stars.test_identification import random_sky
-from tests.adcs.stars.test_pictures import CAMERA, SKY
+from tests.adcs.stars.test_pictures import CAMERA, SKY, rays
 
 
 def read_header(text):
@@ -80,6 +80,17 @@ class TestHeader:
             s *= 1.0 + radial * np.sum(s**2, axis=1, keepdims=True)
             expected = np.concatenate([s, -np.ones((50, 1))], axis=1) / np.sqrt(1.0 + np.sum(s**2, axis=1))[:, None]
             np.testing.assert_allclose(sky_of(header, points + 0.5), expected @ R.T, atol=1e-9)
+
+    @pytest.mark.parametrize("radial", [0.0, 0.1, -0.35])
+    def test_of_an_equidistant_lens(self, radial):
+        """ZPN has the polynomial the other way round; to 1e-6 rad, a thousandth of a pixel."""
+        camera = StarCamera(400, 300, math.radians(0.1), radial, "equidistant")
+        points = np.random.default_rng(0).uniform([0, 0], [400, 300], (50, 2))
+        for R in [*Rotation.random(3, random_state=1).as_matrix(), np.eye(3)]:
+            header = read_header(wcs_header(fix_of(R, camera)))
+            assert header["CTYPE1"] == "RA---ZPN"
+            expected = rays(points, camera, "equidistant", radial) @ R.T
+            np.testing.assert_allclose(sky_of(header, points + 0.5), expected, atol=1e-6)
 
 
 class TestCommand:
