@@ -279,10 +279,11 @@ class LinearProblem:
         white.whiten(Y, np.arange(len(Y)))
         A, y = Y[:, 0, :m], Y[:, 0, m]
         # Of the columns themselves: their products are singular in double precision where some are nearly equal.
-        root = np.linalg.qr(np.concatenate([A, np.eye(m)]), mode="r")
-        inverse = np.linalg.inv(root)
+        with_prior = np.concatenate([np.column_stack([A, y]), np.eye(m, m + 1)])
+        triangle = np.linalg.qr(with_prior, mode="r")[:m]
+        root, inverse = triangle[:, :m], np.linalg.inv(triangle[:, :m])
         covariance = np.asarray(inverse @ inverse.T)
-        mean = covariance @ (A.T @ y)
+        mean = inverse @ triangle[:, m]
         residual = y - A @ mean
         evidence = float(y @ residual) + 2.0 * float(np.log(np.abs(np.diagonal(root))).sum())
         evidence -= 2.0 * float(np.log(white.gains[:, 0, -1]).sum()) - 2.0 * len(y) * float(np.log(background.noise_nT))

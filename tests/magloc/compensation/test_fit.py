@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -127,3 +129,16 @@ class TestPosterior:
         whole = V + A @ A.T
         dense = np.linalg.slogdet(whole)[1] + y @ np.linalg.solve(whole, y)
         assert solved.minus_log_evidence == pytest.approx(dense, abs=0.5)  # of 900: the matrix loses eleven digits
+
+
+def test_posterior_of_columns_that_are_nearly_equal() -> None:
+    """Columns 1e9 times the noise and alike to rounding: their sum is known, their difference is the prior's."""
+    time_s = 0.1 * np.arange(200.0)
+    column = 1e9 * np.sin(time_s)
+    rows = SimpleNamespace(time_s=time_s)
+    empty = np.zeros(0)
+    problem = LinearProblem(rows, column, np.column_stack([column, column]), empty, empty, 0, np.zeros(2))  # type: ignore[arg-type]
+    found = problem.solve(Background.usual(1e-9))
+    assert found.mean.sum() == pytest.approx(1.0)
+    difference = np.array([1.0, -1.0])
+    assert difference @ found.covariance @ difference == pytest.approx(2.0, rel=1e-6)
