@@ -280,7 +280,7 @@ class LinearProblem:
         A, y = Y[:, 0, :m], Y[:, 0, m]
         # Of the columns themselves: their products are singular in double precision where some are nearly equal.
         with_prior = np.concatenate([np.column_stack([A, y]), np.eye(m, m + 1)])
-        triangle = np.linalg.qr(with_prior, mode="r")[:m]
+        triangle = np.asarray(np.linalg.qr(with_prior, mode="r"))[:m]
         root, inverse = triangle[:, :m], np.linalg.inv(triangle[:, :m])
         covariance = np.asarray(inverse @ inverse.T)
         mean = inverse @ triangle[:, m]
