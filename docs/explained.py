@@ -39,7 +39,7 @@ EXPLAINED = {
     " magloc.read_terrain magloc.plots.survey magloc.plots.survey_profiles",
     "review-targets": "magloc.Review",
     "compensation": "magloc.compensate magloc.Compensation magloc.plots.compensation",
-    "instruments": "arrays.instrument_names arrays.read_instrument arrays.Instrument",
+    "instruments": "arrays.instrument_names arrays.read_instrument arrays.Instrument arrays.read_track arrays.Track",
     "tracking": "magloc.track magloc.Track magloc.Tracker magloc.RandomWalk magloc.OrnsteinUhlenbeck"
     " magloc.CoordinatedTurn magloc.FreeMotion magloc.track_sources magloc.SourcesTrack"
     " magloc.SourcesTracker magloc.subtract_rest magloc.plots.track magloc.plots.consistency"

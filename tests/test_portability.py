@@ -41,7 +41,7 @@ OPENING = frozenset(
 )
 # Functions of our own that have the names of methods, and what opens something else than a text file.
 NO_FILES = frozenset(
-    ["read_text", "write_text", "os.open", "webbrowser.open", "Image.open", "self.open", "direct.open"]
+    ["read_text", "write_text", "os.open", "webbrowser.open", "Image.open", "rasterio.open", "self.open", "direct.open"]
 )
 
 

@@ -66,6 +66,8 @@ class Instrument:
         True if the source is not the maker's own.
     add : str
         Sentence that states what the user has to add; empty if nothing.
+    layouts : tuple of mapping
+        Array tables, one for each layout of its logs.
 
     Examples
     --------
@@ -79,7 +81,7 @@ class Instrument:
     source: str
     is_secondary: bool
     add: str
-    _layouts: tuple[Mapping[str, Any], ...]
+    layouts: tuple[Mapping[str, Any], ...]
 
     def array(self, log: str | PathLike[str], keys: str | PathLike[str] | None = None) -> SensorArray:
         """Return the sensors and columns for a log.
@@ -104,14 +106,14 @@ class Instrument:
         own = {} if keys is None else read_toml(keys, "a TOML file of an array")
         place = f"instrument {self.name}" if keys is None else f"{keys} (instrument {self.name})"
         text = ""
-        for layout in self._layouts:
+        for layout in self.layouts:
             table = _merge(layout, own)
             _drop_replaced(table["columns"], own.get("columns", {}))
             columns = table["columns"]
             text = text or read_text(log, "a log of text", columns.get("encoding"))
             if (fitted := _fit(table, text)) is not None:
                 return array_of_table(place, fitted)
-        wanted = " or ".join(", ".join(map(repr, _required(layout["columns"]))) for layout in self._layouts)
+        wanted = " or ".join(", ".join(map(repr, _required(layout["columns"]))) for layout in self.layouts)
         raise InputError(f"{log}: found no header of a log of {self.title}, expected the columns {wanted}.")
 
 
@@ -202,7 +204,7 @@ def read_track(path: str | PathLike[str]) -> Track:
     for name in _TRACKS.names():
         template = _instrument(name, _TRACKS.path(name))
         titles.append(template.title)
-        for layout in template._layouts:
+        for layout in template.layouts:
             if (fitted := _fit(layout, text)) is not None:
                 table = section_of(f"track {name}", fitted["columns"], ColumnsTable)
                 return Track(str(path), table.columns(f"track {name}", {}))
