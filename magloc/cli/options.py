@@ -98,6 +98,12 @@ def ambient_field(
         return with_ambient_field(array, rows, where, gradient=gradient)
 
 
+def in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
+    """Return the array with its ambient field, and the rows with theirs if rows differ."""
+    array, ambient_T = ambient_field(array, rows, where)
+    return array, replace(rows, ambient_T=ambient_T)
+
+
 def naming_place() -> AbstractContextManager[None]:
     """Turn errors of the ambient field into errors about its options."""
     return naming_options("place", "date", "geomagnetic_model", "ambient_gradient")

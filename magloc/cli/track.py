@@ -26,7 +26,7 @@ from magloc.cli.options import (
     KnownOptions,
     MapOptions,
     MotionOptions,
-    ambient_field,
+    in_ambient_field,
     naming_place,
     refuse_not_positive,
 )
@@ -229,7 +229,7 @@ def track(
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     maps.refuse_far(rows, str(readings))
     rows, used = conditioning.apply(rows, used, readings)
-    used, rows = _in_ambient_field(used, rows, where)
+    used, rows = in_ambient_field(used, rows, where)
     if path is not None:
         with named:
             found = _moments(used, rows, path, motion, smooth=smooth)
@@ -336,11 +336,6 @@ def _note_dropped(names: Iterable[str]) -> None:
     """Print the sensors that some rows do not use."""
     if names := sorted(names):
         note(f"sensors left out of some rows: {', '.join(names)}")
-
-
-def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
-    array, ambient_T = ambient_field(array, rows, where)
-    return array, replace(rows, ambient_T=ambient_T)
 
 
 def _is_undetermined(found: Iterable[TrackPoint]) -> bool:

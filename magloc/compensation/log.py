@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,8 @@ from arrays.typing import FloatArray
 from magloc.compensation.attitude import Attitude, AttitudeErrors, currents_at
 from magloc.compensation.fit import FEWEST_ROWS, CalibrationRows
 from magloc.compensation.signals import Signal, white_noise
-from magloc.measurement.rows import check_magnitudes
+from magloc.measurement.plausibility import finite_median
+from magloc.measurement.rows import check_magnitudes, check_order
 from magloc.measurement.screening import wild_readings
 from magloc.navigation.poses import rotations_at
 from magloc.readings import Readings, without_saturated
@@ -66,8 +66,7 @@ class PlatformLog:
         check_magnitudes(array)
         if len(readings) < FEWEST_ROWS:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows or more; instead received {len(readings)}.")
-        if not (np.diff(readings.time_s) > 0.0).all():
-            raise ValueError("Input readings must be in order of time; instead received others.")
+        check_order(readings)
         values, left_out = _clean(array, without_saturated(readings, array), currents)
         readings = replace(readings, values_T=values)
         fields, moduli = array.calibrated_field(values), {}
@@ -77,13 +76,13 @@ class PlatformLog:
                 moduli[sensor.id] = (values[:, channel] - array.channel_offset_T[channel]) / array.channel_gain[
                     channel, 0
                 ]
-        usual = _median(np.stack(list(moduli.values()))) if moduli else np.nan
+        usual = finite_median(np.stack(list(moduli.values()))) if moduli else np.nan
         signals, factors = {}, {}
         for i, sensor in enumerate(array.sensors):
             if sensor.kind == "scalar":
                 signals[sensor.id] = Signal.of(readings.time_s, moduli[sensor.id][:, None])
                 continue
-            ratio = _median(np.linalg.norm(fields[:, i], axis=1)) / usual
+            ratio = finite_median(np.linalg.norm(fields[:, i], axis=1)) / usual
             factors[sensor.id] = 1.0 if np.isnan(ratio) or 1.0 / _SAME_UNIT < ratio < _SAME_UNIT else ratio
             signals[sensor.id] = Signal.of(readings.time_s, fields[:, i] / factors[sensor.id])
         flowing = None if not currents.shape[1] else Signal.of(readings.time_s, currents)
@@ -162,12 +161,6 @@ class PlatformLog:
         return CalibrationRows(
             time_s, np.linalg.norm(values, axis=1), attitude, is_own, self.currents, place, float(noise)
         )
-
-
-def _median(values: FloatArray) -> float:
-    """Return the median of what is known; NaN if nothing is."""
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else math.nan
 
 
 def columns_of(currents: Mapping[str, ArrayLike] | None, names: tuple[str, ...], n: int) -> FloatArray:

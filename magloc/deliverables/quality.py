@@ -19,8 +19,8 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
 from magloc.grids.work import workers
 from magloc.localization.fit.prior import NOTHING_KNOWN
-from magloc.measurement.plausibility import EARTH_T
-from magloc.measurement.rows import check_magnitudes, concatenate_readings
+from magloc.measurement.plausibility import EARTH_T, finite_median
+from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
 from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
 from magloc.readings import Readings
@@ -322,8 +322,7 @@ def check_quality(
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     if len(rows) < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} rows or more; instead received {len(rows)}.")
-    if not (np.diff(rows.time_s) > 0.0).all():
-        raise ValueError("Input readings must be in order of time; instead received others.")
+    check_order(rows)
     check_magnitudes(array)
     fixes = between_fixes(rows.time_s, rows.array_position_m, rows.array_rotation)
     held = 0.0 if fixes is None else fixes.held / len(rows)
@@ -352,7 +351,7 @@ def check_quality(
         [heading_error(place_m[:, :2], column, lines) for column in _without_ambient(rows, moduli_T).T],
         _clock_lag(array, rows[np.flatnonzero(~unusable.any(axis=1))], ground, coverage),
         coverage,
-        np.array([float(np.median(known)) if (known := m[np.isfinite(m)]).size else math.nan for m in moduli_T.T]),
+        np.array([finite_median(column) for column in moduli_T.T]),
         held,
     )
 
@@ -377,8 +376,7 @@ def _fourth_differences(time_s: FloatArray, values: FloatArray) -> FloatArray:
 
 def _spread(values: FloatArray) -> float:
     """Return the standard deviation of Gaussian values with outliers; NaN without any value."""
-    known = np.abs(values[np.isfinite(values)])
-    return _GAUSSIAN * float(np.median(known)) if known.size else math.nan
+    return _GAUSSIAN * finite_median(np.abs(values))
 
 
 def _without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:

@@ -118,7 +118,7 @@ def record_doubts(array: SensorArray, readings: Readings, used: Readings | None 
             )
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
     of_unit = list(
-        _moduli_doubts(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1)))
+        _moduli_doubts(used.values_T[:, array.channel_is_scalar], finite_median(np.linalg.norm(ambient_T, axis=-1)))
     )
     yield from of_unit or _ambient_doubts(array, used)
     if used.pose is not None:
@@ -189,7 +189,8 @@ def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
     differences of every other row. Filtered noise, and a source too fast for the rows, are several times larger there.
     """
     own = _beyond_each_other(array, values_T)
-    ratio, of_every_other = (_median(np.abs(_sixth_difference(own, lag))) / 0.6745 for lag in (1, 2))  # if Gaussian
+    # The median of Gaussian errors is 0.6745 of their σ.
+    ratio, of_every_other = (finite_median(np.abs(_sixth_difference(own, lag))) / 0.6745 for lag in (1, 2))
     return ratio if 0.0 < of_every_other < _WHITE * ratio else float("nan")
 
 
@@ -223,7 +224,7 @@ def _moduli_doubts(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
 
     Values of both signs are residuals after the field was subtracted.
     """
-    read = _median(moduli_T)
+    read = finite_median(moduli_T)
     unlike = read < ambient_T / _OTHER_UNIT or read > ambient_T * _OTHER_UNIT
     if ambient_T > 0.0 and unlike and not (moduli_T < 0.0).any():
         yield (
@@ -248,8 +249,8 @@ def _ambient_doubts(array: SensorArray, used: Readings) -> Iterator[str]:
         moduli = np.where(scalar, moduli, np.nan)
     stated = np.linalg.norm(ambient_fields(array, len(used), used.ambient_T), axis=2)
     of_sensors = [_shortest_half(d[np.isfinite(d)]) for d in (moduli - stated).T if np.isfinite(d).any()]
-    modulus_T = _median(stated)
-    was_taken_off = not _median(moduli) > modulus_T / _OTHER_UNIT or bool((moduli < 0.0).any())
+    modulus_T = finite_median(stated)
+    was_taken_off = not finite_median(moduli) > modulus_T / _OTHER_UNIT or bool((moduli < 0.0).any())
     if was_taken_off or np.isfinite(moduli).sum() < _FEWEST_COMPARED:
         return
     levels, widths = np.array(of_sensors).T
@@ -354,6 +355,7 @@ def _attitude_doubts(array: SensorArray, readings: Readings, rotation: Rotation)
     )
 
 
-def _median(values: FloatArray) -> float:
+def finite_median(values: FloatArray) -> float:
+    """Return the median of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")

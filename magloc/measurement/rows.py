@@ -227,6 +227,12 @@ def check_spans(array: SensorArray) -> None:
         raise ValueError("Input array must have at least two sensors if no position is known; instead received one.")
 
 
+def check_order(readings: Readings) -> None:
+    """Raise ValueError for rows that are not in order of time."""
+    if not (np.diff(readings.time_s) > 0.0).all():
+        raise ValueError("Input readings must be in order of time; instead received others.")
+
+
 def check_magnitudes(array: SensorArray) -> None:
     """Raise ValueError for numbers whose squares exceed the range of double precision."""
     noise = array.channel_noise_T

@@ -11,7 +11,7 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
-from magloc.measurement.rows import check_magnitudes
+from magloc.measurement.rows import check_magnitudes, check_order
 from magloc.measurement.screening import wild_readings
 from magloc.navigation.fixes import between_fixes, interval_of_fixes
 from magloc.navigation.poses import vectors_at
@@ -69,8 +69,7 @@ def whole_rows(
     if len(kept) < array.n_sensors:
         readings = replace(readings, values_T=readings.values_T[:, np.isin(array.channel_sensor, kept)])
     readings = _some(readings, whole)
-    if not (np.diff(readings.time_s) > 0.0).all():
-        raise ValueError("Input readings must be in order of time; instead received others.")
+    check_order(readings)
     readings = _some(readings, ~leaping_rows(readings))
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
     array = with_stated_pose(array, readings)

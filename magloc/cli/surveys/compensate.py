@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +13,7 @@ from arrays.io.errors import naming, naming_options
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, print_report, warn
-from magloc.cli.options import KnownOptions, LogOptions, ambient_field, refuse_not_positive
+from magloc.cli.options import KnownOptions, LogOptions, in_ambient_field, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -120,5 +120,4 @@ def _with_ambient(array: SensorArray, readings: magloc.Readings, known: KnownOpt
     """Return readings with the ambient field of every row, if they need it for their attitude."""
     if not array.channel_is_scalar.all():
         return readings
-    array, ambient_T = ambient_field(array, readings, known.where)
-    return replace(readings, ambient_T=ambient_T)
+    return in_ambient_field(array, readings, known.where)[1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,7 @@ from arrays.io.errors import naming
 from arrays.io.outputs import refuse_file, write_files
 from arrays.typing import Vector
 from magloc.cli.framework import Flag, QuietOptions, print_report
-from magloc.cli.options import KnownOptions, LogOptions, ambient_field
+from magloc.cli.options import KnownOptions, LogOptions, in_ambient_field
 from magloc.cli.surveys.ground import SurfaceOptions
 
 
@@ -65,10 +64,9 @@ def qc(
     where = None if known.place is None or known.date is None else known.where
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     ground, parts, _ = surface.below(readings, parts, used, known.place)
-    fields = [ambient_field(used, part, where) for part in parts]
-    rows = [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
+    fields = [in_ambient_field(used, part, where) for part in parts]
     with naming(", ".join(map(str, readings)), array=log.name):
-        quality = magloc.check_quality(fields[0][0], rows, ground_m=ground)
+        quality = magloc.check_quality(fields[0][0], [rows for _, rows in fields], ground_m=ground)
     write_files(out, _files(quality) if out is not None else ())
     if json:
         print_report(quality.entries)

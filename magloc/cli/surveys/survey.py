@@ -20,7 +20,7 @@ from magloc.cli.options import (
     LogOptions,
     MapOptions,
     Port,
-    ambient_field,
+    in_ambient_field,
     refuse_not_positive,
 )
 from magloc.cli.surveys.ground import SurfaceOptions
@@ -38,14 +38,6 @@ class GroundOptions(SurfaceOptions):
 
     Parameters
     ----------
-    ground_m : float
-        Height of the ground in the world frame [m]. With --terrain: amount to add to its heights, such as the height of
-        the sea above the ellipsoid.
-    terrain : str
-        Heights of uneven ground: a GeoTIFF (.tif) in any coordinate system, a CSV file with columns x, y, height or
-        easting, northing, height or longitude, latitude, height, or the name of the log's column with the height above
-        ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
-        from the ground.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; smaller anomalies are targets.
     false_per_hectare : float
@@ -167,8 +159,8 @@ def survey(
         where = where and known.where
     for path, part in zip(readings, parts, strict=True):
         maps.refuse_far(part, str(path), always=out is not None and frame is not None)
-    fields = [ambient_field(used, part, where) for part in parts]
-    used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
+    fields = [in_ambient_field(used, part, where) for part in parts]
+    used, rows = fields[0][0], [own for _, own in fields]
     at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
     station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
     named = naming(", ".join(map(str, readings)), array=log.name)
