@@ -144,7 +144,7 @@ def _pictures(
 ) -> None:
     from adcs.plots.stars import picture_figure
     from adcs.stars.identification import NoFix
-    from adcs.stars.lens import lens_text, read_lens
+    from adcs.stars.lens import calibrate_lens, lens_text, read_lens
     from adcs.stars.wcs import wcs_header
     from arrays.io.outputs import refuse_file, write_files
 
@@ -184,7 +184,7 @@ def _pictures(
                 "scale_arcsec": _arcsec(camera.rad_per_px),
                 "scale_sigma_arcsec": _arcsec(camera.rad_per_px * sigma[3]),
                 "corner_px": camera.corner_shift_px,
-                "corner_sigma_px": sigma[4] * camera.corner**2 * half_diagonal_px,
+                "corner_sigma_px": found.pose.corner_sigma * half_diagonal_px,
                 "lens": camera.projection,
                 "field_deg": math.degrees(math.acos(sides[0] @ sides[1])),
                 "mirrored": found.mirrored,
@@ -202,10 +202,11 @@ def _pictures(
     headers = [(f"{path.stem}.wcs", wcs_header(fix)) for path, _, _, fix in solved if fix is not None]
     if headers:
         write_files(wcs, headers, "--wcs")
-    fixes = [fix for *_, fix in solved if fix is not None]
+    fixes = [(lights, fix) for *_, lights, fix in solved if fix is not None]
     if lens is not None and known_lens is None and fixes:
-        best = max(fixes, key=lambda fix: len(fix.stars))
-        write_files(lens.parent, [(lens.name, lens_text(best.pose))], "--lens")
+        lights, fix = max(fixes, key=lambda solved: len(solved[1].stars))
+        pose = calibrate_lens(fix, lights.points_px, known, noise_px)
+        write_files(lens.parent, [(lens.name, lens_text(pose))], "--lens")
     report.print({"pictures": rows}, [_picture_line(row) for row in rows])
 
 

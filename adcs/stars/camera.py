@@ -1,4 +1,4 @@
-"""Star camera: a pinhole or equidistant lens with radial distortion."""
+"""Star camera: a pinhole or equidistant lens with the distortion of Brown and Conrady."""
 
 from __future__ import annotations
 
@@ -19,13 +19,18 @@ MOST_PIXELS = 100_000
 SCALE_ARCSEC = (0.01, 3600.0)
 """Range of a pixel's size, from the largest telescopes to one degree."""
 _MOST_ANGLE_RAD = math.radians(89.0)
+DISTORTION_DEGREES = np.array([3.0, 5.0, 2.0, 2.0])
+"""Degree of each distortion in the place."""
 WIDEST_RAD = math.radians(150.0)
 """Largest angle between opposite corners; tangents of more are useless."""
 
 
 @dataclass(frozen=True)
 class StarCamera:
-    """Camera with a lens: places s = tan(rad_per_px) x, distorted to q = s (1 + radial |s|²).
+    """Camera with a lens: places s = tan(rad_per_px) x, corrected to q by the formula of Brown and Conrady.
+
+    .. math:: q = s (1 + k_1 |s|^2 + k_2 |s|^4) + (2 p_1 s_x s_y + p_2 (|s|^2 + 2 s_x^2),
+              p_1 (|s|^2 + 2 s_y^2) + 2 p_2 s_x s_y)
 
     The length of q is the tangent of the angle from the axis for a pinhole, and the angle for an equidistant lens.
 
@@ -36,9 +41,13 @@ class StarCamera:
     rad_per_px : float
         Scale at the centre.
     radial : float
-        Distortion; if positive, a star is nearer to the centre than without it.
+        Distortion k₁; if positive, a star is nearer to the centre than without it.
     projection : str
         "pinhole" or "equidistant".
+    radial2 : float
+        Distortion k₂.
+    tangential : tuple of float
+        Distortions p₁ and p₂, of a lens whose elements are not centred.
 
     Raises
     ------
@@ -51,6 +60,8 @@ class StarCamera:
     rad_per_px: float
     radial: float = 0.0
     projection: Projection = "pinhole"
+    radial2: float = 0.0
+    tangential: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         check_positive(width_px=self.width_px, height_px=self.height_px, rad_per_px=self.rad_per_px)
@@ -87,9 +98,9 @@ class StarCamera:
     @property
     def corner_shift_px(self) -> float:
         """Displacement of a corner by the distortion, negative towards the centre."""
-        bent, x = self.radial * self.corner**2, 1.0
-        for _ in range(8):  # Newton's method for x (1 + bent x²) = 1
-            x -= (x * (1.0 + bent * x**2) - 1.0) / (1.0 + 3.0 * bent * x**2)
+        k1, k2, x = self.radial * self.corner**2, self.radial2 * self.corner**4, 1.0
+        for _ in range(8):  # Newton's method for x (1 + k1 x² + k2 x⁴) = 1
+            x -= (x * (1.0 + k1 * x**2 + k2 * x**4) - 1.0) / (1.0 + 3.0 * k1 * x**2 + 5.0 * k2 * x**4)
         return 0.5 * math.hypot(self.width_px, self.height_px) * (x - 1.0)
 
     def tangents(self, points_px: ArrayLike) -> FloatArray:
@@ -105,16 +116,28 @@ class StarCamera:
             raise ValueError(
                 f"Input points_px must be finite numbers of shape (f, 2); instead received shape {points.shape}."
             )
-        places = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
-        bent: FloatArray = places * (1.0 + self.radial * np.sum(places**2, axis=1, keepdims=True))
+        bent = self.corrected(self.image_places(points))
         if self.projection == "equidistant":
             # Distortions far outside the picture must not turn a star to behind the camera.
             angle = np.minimum(np.linalg.norm(bent, axis=1, keepdims=True), _MOST_ANGLE_RAD)
             bent = bent * np.tan(angle) / np.maximum(np.linalg.norm(bent, axis=1, keepdims=True), 1e-300)
         return bent
 
+    @property
+    def distortion(self) -> FloatArray:
+        """Coefficients k₁, k₂, p₁, p₂."""
+        return np.array([self.radial, self.radial2, *self.tangential])
+
+    def image_places(self, points_px: FloatArray) -> FloatArray:
+        """Return the places s (f, 2) of points (f, 2) of the image."""
+        return (points_px - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
+
+    def corrected(self, places: FloatArray) -> FloatArray:
+        """Return the places q (f, 2) without distortion of places s (f, 2) of the image."""
+        return places + distortion_terms(places) @ self.distortion
+
     def places(self, tangents: FloatArray) -> FloatArray:
-        """Return the distorted places q (f, 2) of tangents (f, 2)."""
+        """Return the places q (f, 2) of tangents (f, 2)."""
         if self.projection == "pinhole":
             return tangents
         length = np.maximum(np.linalg.norm(tangents, axis=1, keepdims=True), 1e-12)
@@ -139,10 +162,19 @@ class StarCamera:
         return outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
 
+def distortion_terms(places: FloatArray) -> FloatArray:
+    """Return the derivatives (f, 2, 4) of q by k₁, k₂, p₁, p₂ at places s (f, 2); see :data:`DISTORTION_DEGREES`."""
+    x, y = places[:, 0], places[:, 1]
+    squared = np.sum(places**2, axis=1)
+    first = np.stack([2.0 * x * y, squared + 2.0 * y**2], axis=1)
+    second = np.stack([squared + 2.0 * x**2, 2.0 * x * y], axis=1)
+    return np.stack([places * squared[:, None], places * squared[:, None] ** 2, first, second], axis=2)
+
+
 def as_projection(camera: StarCamera, projection: Projection) -> StarCamera:
     """Return a camera with another projection that shows the same up to the third power of the angle."""
     if projection == camera.projection:
         return camera
     # atan t = t - t³/3 + …
     cube = 1.0 / 3.0 if camera.projection == "equidistant" else -1.0 / 3.0
-    return replace(camera, projection=projection, radial=camera.radial + cube)
+    return replace(camera, projection=projection, radial=camera.radial + cube, radial2=0.0, tangential=(0.0, 0.0))

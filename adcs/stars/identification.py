@@ -35,7 +35,7 @@ _CROWDED = 4.0  # largest density of stars over the mean
 _WIDENED = 2.0  # gate of a hypothesis from three noisy stars over the usual one
 _REFITS = 6
 # Gates over the usual one of a wide field, whose lens may bend the corners; its prior.
-_NARROWING, _STRONG_LENS = (2.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0), LensPrior(scale=0.1, bent=0.1)
+_NARROWING, _STRONG_LENS = (2.0, 4.0, 4.0, 3.0, 3.0, 2.0, 2.0), LensPrior(scale=0.1, bent=0.1, bent2=0.02)
 # Numbers of the brightest lights whose match is tested: in a picture only the brightest may be stars.
 _BEGINNINGS = (15, 30, 60, 100)
 _COMPANIONS = 3  # largest number of catalogue stars within the noise of one place
@@ -226,7 +226,7 @@ class StarMatcher:
     def _pose(self, hypothesis: AttitudeHypothesis) -> CameraPose:
         """Return the pose of a hypothesis, without a covariance."""
         rad_per_px = math.atan(hypothesis.scale * math.tan(self.camera.rad_per_px))
-        return CameraPose(hypothesis.R, replace(self.camera, rad_per_px=rad_per_px), np.zeros((5, 5)))
+        return CameraPose(hypothesis.R, replace(self.camera, rad_per_px=rad_per_px), np.zeros((8, 8)))
 
     def refine_lens(self, points_px: FloatArray, magnitudes: FloatArray, fix: StarFix) -> StarFix:
         """Fit the lens of a wide field to more stars, as a pinhole and as an equidistant lens; the better one.

@@ -1,26 +1,44 @@
 """Lens of a star camera as a file: fitted from one photograph, used for others.
 
-A TOML file with ``projection`` ("pinhole" or "equidistant"), ``width_px``, ``height_px``, ``scale_arcsec`` (of a pixel
-at the centre) and ``radial``, as in :class:`adcs.stars.camera.StarCamera`, and the standard deviations
-``scale_sigma_arcsec`` and ``radial_sigma``.
+A TOML file; :class:`LensFile` names its keys.
 """
 
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass
 from os import PathLike
+from typing import Annotated, cast, get_args
 
 from adcs.stars.camera import Projection, StarCamera
-from adcs.stars.pose import CameraPose, LensPrior
+from adcs.stars.catalogue import StarCatalogue
+from adcs.stars.identification import StarFix
+from adcs.stars.pose import CameraPose, LensPrior, fit_pose
 from arrays.io.errors import InputError
-from arrays.io.text import read_text
+from arrays.io.toml import File, NotNegative, Positive, Rule, one_of, read_toml, section_of
+from arrays.typing import FloatArray
 
 _ARCSEC = math.radians(1.0 / 3600.0)
 _SCALE, _BENT = 1e-3, 1e-3
 """Least standard deviations of a lens that is used again, because of heat and focus: see LensPrior."""
-_KEYS = ("width_px", "height_px", "scale_arcsec", "radial", "scale_sigma_arcsec", "radial_sigma")
+_CALIBRATION, _STEPS = LensPrior(scale=0.1, bent=0.1, bent2=0.02, tangential=0.02), 6
+_Pixels = Annotated[int, Rule(lambda value: value > 0, "a positive whole number")]
+
+
+class LensFile(File, kw_only=True):
+    """Lens of a camera as in :class:`adcs.stars.camera.StarCamera`, with standard deviations."""
+
+    projection: Annotated[str, one_of(get_args(Projection))]
+    width_px: _Pixels
+    height_px: _Pixels
+    scale_arcsec: Positive
+    """Size of a pixel at the centre."""
+    radial: float
+    radial2: float = 0.0
+    tangential: tuple[float, float] = (0.0, 0.0)
+    scale_sigma_arcsec: NotNegative
+    radial_sigma: NotNegative
+    """Standard deviation of a corner's displacement, as that of k₁."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +57,38 @@ class KnownLens:
             )
 
 
+def calibrate_lens(fix: StarFix, points_px: FloatArray, catalogue: StarCatalogue, noise_px: float) -> CameraPose:
+    """Fit the lens with all its distortions to the stars of a solved photograph, for other photographs.
+
+    Tangential distortions are fitted here alone: with few stars they are hard to tell from the attitude.
+    """
+    points = points_px[fix.stars[:, 0]]
+    if fix.mirrored:
+        points = points * [-1.0, 1.0] + [fix.pose.camera.width_px, 0.0]
+    pose = fix.pose
+    for _ in range(_STEPS):
+        pose = fit_pose(points, catalogue.directions[fix.stars[:, 1]], pose, fix.pose.camera, _CALIBRATION, noise_px)
+    return pose
+
+
 def lens_text(pose: CameraPose) -> str:
     """Return the lens of a fitted pose as the text of a TOML file."""
-    camera, covariance = pose.camera, pose.covariance
+    camera = pose.camera
     values = {
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         "scale_arcsec": float(camera.rad_per_px) / _ARCSEC,
         "radial": float(camera.radial),
-        "scale_sigma_arcsec": camera.rad_per_px * math.sqrt(covariance[3, 3]) / _ARCSEC,
-        "radial_sigma": math.sqrt(covariance[4, 4]),
+        "radial2": float(camera.radial2),
+        "tangential": [float(p) for p in camera.tangential],
+        "scale_sigma_arcsec": camera.rad_per_px * math.sqrt(pose.covariance[3, 3]) / _ARCSEC,
+        "radial_sigma": pose.corner_sigma / camera.corner**2,
     }
     return f'projection = "{camera.projection}"\n' + "".join(f"{key} = {value!r}\n" for key, value in values.items())
 
 
 def read_lens(path: str | PathLike[str]) -> KnownLens:
-    """Read the lens of a camera from a TOML file; see :mod:`adcs.stars.lens`.
+    """Read the lens of a camera from a TOML file; see :class:`LensFile`.
 
     Parameters
     ----------
@@ -71,25 +105,18 @@ def read_lens(path: str | PathLike[str]) -> KnownLens:
     InputError
         The file cannot be read, or a value is missing or out of range.
     """
-    try:
-        values = tomllib.loads(read_text(path, "a lens as --lens writes it"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: found no TOML ({error}), expected a lens as --lens writes it.") from None
-    named = values.get("projection")
-    projection: Projection = "equidistant" if named == "equidistant" else "pinhole"
-    if named != projection:
-        raise InputError(f'{path}: found projection = {named!r}, expected "pinhole" or "equidistant".')
-    for key in _KEYS:
-        value = values.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise InputError(f"{path}: found {key} = {value!r}, expected a finite number.")
-        if (key.endswith("_px") and not isinstance(value, int)) or (key.startswith(("scale", "w", "h")) and value <= 0):
-            raise InputError(f"{path}: found {key} = {value!r}, expected a positive number, in pixels a whole one.")
+    lens = section_of(str(path), read_toml(path, "a lens as --lens writes it"), LensFile)
     try:
         camera = StarCamera(
-            values["width_px"], values["height_px"], values["scale_arcsec"] * _ARCSEC, values["radial"], projection
+            lens.width_px,
+            lens.height_px,
+            lens.scale_arcsec * _ARCSEC,
+            lens.radial,
+            cast(Projection, lens.projection),
+            lens.radial2,
+            lens.tangential,
         )
     except ValueError as error:
         raise InputError(f"{path}: {error}") from None
-    scale = max(values["scale_sigma_arcsec"] / values["scale_arcsec"], _SCALE)
-    return KnownLens(camera, LensPrior(scale, max(abs(values["radial_sigma"]) * camera.corner**2, _BENT)))
+    scale = max(lens.scale_sigma_arcsec / lens.scale_arcsec, _SCALE)
+    return KnownLens(camera, LensPrior(scale, max(lens.radial_sigma * camera.corner**2, _BENT)))

@@ -1,8 +1,8 @@
 """World coordinates of a solved photograph as a FITS header.
 
-The header of a pinhole has the gnomonic projection TAN, with the radial distortion as polynomials of the convention
-SIP. That of an equidistant lens has the zenithal polynomial projection ZPN. By FITS, the centre of the first pixel is
-(1, 1), and the first row is at the bottom.
+The header of a pinhole has the gnomonic projection TAN, with the distortion as polynomials of the convention SIP. That
+of an equidistant lens has the zenithal polynomial projection ZPN. By FITS, the centre of the first pixel is (1, 1), and
+the first row is at the bottom.
 
 Sources: Calabretta and Greisen, Representations of celestial coordinates in FITS, 2002; Shupe et al., The SIP
 convention for representing distortion in FITS image headers, 2005.
@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from adcs.stars.camera import StarCamera
+from adcs.stars.camera import DISTORTION_DEGREES, StarCamera
 from adcs.stars.identification import StarFix
 from arrays.typing import FloatArray
 
@@ -33,7 +33,7 @@ def wcs_header(fix: StarFix) -> str:
     degrees = math.degrees(scale) * _plane_from_frame(R) @ np.diag([-1.0 if fix.mirrored else 1.0, 1.0])
     axis = -R[:, 2]
     cards: dict[str, str | int | float | bool] = {"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "WCSAXES": 2}
-    bent = camera.radial * scale**2
+    bent = bool(camera.distortion.any())
     equidistant = camera.projection == "equidistant"
     suffix = "ZPN" if equidistant else "TAN-SIP" if bent else "TAN"
     cards |= {"CTYPE1": f"RA---{suffix}", "CTYPE2": f"DEC--{suffix}", "CUNIT1": "deg", "CUNIT2": "deg"}
@@ -45,9 +45,23 @@ def wcs_header(fix: StarFix) -> str:
     if equidistant:
         cards |= {f"PV2_{m}": value for m, value in _places_of_angles(camera).items()}
     elif bent:
-        cards |= {"A_ORDER": 3, "B_ORDER": 3, "A_3_0": bent, "A_1_2": bent, "B_0_3": bent, "B_2_1": bent}
+        cards |= _sip(camera, scale, fix.mirrored)
     text = "".join(_card(name, value) for name, value in cards.items()) + "END".ljust(_CARD)
     return text.ljust(-(-len(text) // _BLOCK) * _BLOCK)
+
+
+def _sip(camera: StarCamera, scale: float, mirrored: bool) -> dict[str, int | float]:
+    """Return the polynomials of the convention SIP, in pixels of the file."""
+    k1, k2, p1, p2 = (
+        camera.distortion * scale ** (DISTORTION_DEGREES - 1.0) * [1.0, 1.0, 1.0, -1.0 if mirrored else 1.0]
+    )
+    along = {"2_0": 3.0 * p2, "1_1": 2.0 * p1, "0_2": p2, "3_0": k1, "1_2": k1, "5_0": k2, "3_2": 2.0 * k2, "1_4": k2}
+    across = {"2_0": p1, "1_1": 2.0 * p2, "0_2": 3.0 * p1, "0_3": k1, "2_1": k1, "0_5": k2, "2_3": 2.0 * k2, "4_1": k2}
+    return {"A_ORDER": 5, "B_ORDER": 5} | {
+        f"{name}_{powers}": float(value)
+        for name, terms in (("A", along), ("B", across))
+        for powers, value in terms.items()
+    }
 
 
 def _plane_from_frame(R: FloatArray) -> FloatArray:
@@ -60,9 +74,9 @@ def _plane_from_frame(R: FloatArray) -> FloatArray:
 
 
 def _places_of_angles(camera: StarCamera) -> dict[int, float]:
-    """Return the coefficients of ζ, ζ³, … of the place s at the angle ζ = s (1 + radial s²) from the axis."""
+    """Return the coefficients of ζ, ζ³, … of the place s at the angle ζ = s (1 + k₁ s² + k₂ s⁴) from the axis."""
     place = np.linspace(0.0, 1.02 * camera.corner, 400)[1:]
-    angle = place * (1.0 + camera.radial * place**2)
+    angle = place * (1.0 + camera.radial * place**2 + camera.radial2 * place**4)
     powers = np.arange(1, _ZPN_POWERS, 2)
     fitted = np.linalg.lstsq((angle / angle[-1])[:, None] ** powers, place, rcond=None)[0]
     return {int(m): float(value / angle[-1] ** m) for m, value in zip(powers, fitted, strict=True)}

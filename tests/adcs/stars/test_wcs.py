@@ -65,11 +65,13 @@ def fix_of(R, camera, mirrored=False):
 
 
 class TestHeader:
-    @pytest.mark.parametrize("radial", [0.0, 0.3, -0.2])
+    @pytest.mark.parametrize(
+        ("radial", "radial2", "p1", "p2"), [(0.0,) * 4, (0.3, 0.0, 0.0, 0.0), (-0.2, 0.4, 0.01, -0.02)]
+    )
     @pytest.mark.parametrize("mirrored", [False, True])
-    def test_is_the_direction_of_each_pixel(self, radial, mirrored):
+    def test_is_the_direction_of_each_pixel(self, radial, radial2, p1, p2, mirrored):
         """At the poles too; the centre of the picture is half a pixel from the centre of a FITS pixel."""
-        camera = StarCamera(400, 300, math.radians(0.1), radial)
+        camera = StarCamera(400, 300, math.radians(0.1), radial, "pinhole", radial2, (p1, p2))
         points = np.random.default_rng(0).uniform([0, 0], [400, 300], (50, 2))
         looks = [*Rotation.random(5, random_state=1).as_matrix(), np.eye(3), np.diag([1.0, -1.0, -1.0])]
         for R in looks:
@@ -77,7 +79,10 @@ class TestHeader:
             assert header["CTYPE1"] == ("RA---TAN-SIP" if radial else "RA---TAN")
             as_solved = points * [-1.0, 1.0] + [400.0, 0.0] if mirrored else points
             s = (as_solved - [200.0, 150.0]) * math.tan(math.radians(0.1))
-            s *= 1.0 + radial * np.sum(s**2, axis=1, keepdims=True)
+            (x, y), squared = s.T, np.sum(s**2, axis=1)
+            s = s * (1.0 + radial * squared + radial2 * squared**2)[:, None]
+            s[:, 0] += 2.0 * p1 * x * y + p2 * (squared + 2.0 * x**2)
+            s[:, 1] += p1 * (squared + 2.0 * y**2) + 2.0 * p2 * x * y
             expected = np.concatenate([s, -np.ones((50, 1))], axis=1) / np.sqrt(1.0 + np.sum(s**2, axis=1))[:, None]
             np.testing.assert_allclose(sky_of(header, points + 0.5), expected @ R.T, atol=1e-9)
 
