@@ -24,7 +24,7 @@ def picture_figure(
     height, width = picture.shape
     figure = style.new_figure(style.WIDTH_IN * height / width + 0.5)
     ax = figure.add_subplot()
-    low, high = np.quantile(picture, [0.2, 0.999])
+    low, high = np.nanquantile(picture, [0.2, 0.999])
     shown = np.arcsinh(np.clip(5.0 * (picture - low) / max(high - low, 1e-12), 0.0, None))
     ax.imshow(shown, cmap="gray", extent=(0, width, 0, height), interpolation="nearest")
     text = "no fix"

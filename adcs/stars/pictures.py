@@ -33,6 +33,7 @@ _HALF_WINDOW = 3
 _WEIGHT_PX, _ROUNDS = 1.2, 6  # width of the weight of centroids, and number of iterations
 _SIGMA_OF_MAD = 1.4826
 _MOST_PIXELS = 10**8
+_LEAST_FINITE = 0.5  # share of the pixels of a picture or a block
 _FITS_BLOCK, _FITS_CARD = 2880, 80
 _FITS_TYPES = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 
@@ -68,7 +69,7 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     Returns
     -------
     ndarray, shape (height, width)
-        Grey values as in the file, any unit; the first row is at the top.
+        Grey values as in the file, any unit; the first row is at the top. Masked pixels of a FITS file are NaN.
 
     Raises
     ------
@@ -118,8 +119,10 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
         kind = np.dtype(_FITS_TYPES[int(header["BITPIX"])])
         width, height = int(header["NAXIS1"]), int(header["NAXIS2"])
         values = np.frombuffer(data, kind, width * height, start).reshape(height, width)
-        with np.errstate(invalid="ignore", over="ignore"):  # _check_picture refuses numbers that are not finite
+        with np.errstate(invalid="ignore", over="ignore"):
             scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
+        if kind.kind != "f" and "BLANK" in header:
+            scaled[values == int(header["BLANK"])] = np.nan
     except (KeyError, OverflowError, ValueError):
         raise InputError(
             f"{path}: found no image in two dimensions, expected one as the first of a FITS file."
@@ -129,9 +132,12 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
 
 def _check_picture(path: str | PathLike[str], values: np.ndarray) -> FloatArray:
     picture = np.asarray(values, dtype=np.float64)
-    if picture.ndim != 2 or min(picture.shape) < LEAST_PX or not np.isfinite(picture).all():
-        raise InputError(f"{path}: found a picture of shape {picture.shape}, expected 64 × 64 finite pixels at least.")
-    return picture
+    if picture.ndim != 2 or min(picture.shape) < LEAST_PX:
+        raise InputError(f"{path}: found a picture of shape {picture.shape}, expected 64 × 64 pixels at least.")
+    finite = np.isfinite(picture)
+    if finite.mean() < _LEAST_FINITE:
+        raise InputError(f"{path}: found {100 * finite.mean():.0f} % finite pixels, expected half of them at least.")
+    return np.where(finite, picture, np.nan)
 
 
 def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> PictureStars:
@@ -141,21 +147,24 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
     blocks. A light nearly all in one pixel is a hot pixel. Centroids are first moments, weighted by a Gaussian about
     the centroid, in a window of 7 pixels.
 
-    ``picture``, ``dark`` (height, width): the dark picture is subtracted. The brightest light comes first.
+    ``picture``, ``dark`` (height, width): the dark picture is subtracted. Pixels that are NaN are masked. A light
+    with a masked pixel among its middle 25 is left out. The brightest light comes first.
     """
     values = picture if dark is None else picture - dark
+    masked = ~np.isfinite(values)
     level = _neighbourhood_statistic(values, lambda block: float(np.median(block)))
-    above = values - level
-    noise = _neighbourhood_statistic(above, _deviation(1.0))
+    noise = _neighbourhood_statistic(values - level, _deviation(1.0))
+    above = np.where(masked, 0.0, values - level)
     # The noise of the sum with the star's shape is measured, because noise of neighbouring pixels may be correlated.
     kernel = np.exp(-0.5 * (np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1) / _STAR_PX) ** 2)
     kernel /= kernel.sum()
     smooth = ndimage.correlate1d(ndimage.correlate1d(above, kernel, axis=0), kernel, axis=1)
-    significance = smooth / _neighbourhood_statistic(smooth, _deviation(float(np.sum(kernel**2))))
+    deviation = _deviation(float(np.sum(kernel**2)))
+    significance = smooth / _neighbourhood_statistic(np.where(masked, np.nan, smooth), deviation)
     peak = (significance > _THRESHOLD_SIGMAS) & (significance == ndimage.maximum_filter(significance, 5))
     inside = np.zeros_like(peak)
     inside[_HALF_WINDOW:-_HALF_WINDOW, _HALF_WINDOW:-_HALF_WINDOW] = True
-    rows, columns = np.nonzero(peak & inside)
+    rows, columns = np.nonzero(peak & inside & ~ndimage.maximum_filter(masked, 5))
     around = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
     windows = above[rows[:, None, None] + around[:, None], columns[:, None, None] + around]
     light = np.maximum(windows, 0.0) * (windows > 2.0 * noise[rows, columns][:, None, None])
@@ -166,7 +175,7 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
     offsets, slope = _centroids(windows)
     sigma = noise[rows, columns] * slope
     x, y = columns + offsets[:, 0] + 0.5, len(values) - (rows + offsets[:, 1] + 0.5)
-    saturated = windows.max(axis=(1, 2)) + level[rows, columns] >= 0.98 * picture.max()
+    saturated = windows.max(axis=(1, 2)) + level[rows, columns] >= 0.98 * np.nanmax(picture)
     order = np.argsort(-flux, kind="stable")
     return PictureStars(np.stack([x, y], axis=1)[order], sigma[order], flux[order], saturated[order])
 
@@ -191,14 +200,24 @@ def _centroids(windows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _neighbourhood_statistic(values: FloatArray, statistic: Callable[[FloatArray], float]) -> FloatArray:
-    """Return a statistic of the blocks around each pixel, interpolated."""
+    """Return a statistic of the finite pixels in the blocks around each pixel, interpolated.
+
+    A block with few finite pixels has the statistic of the nearest other block.
+    """
+
+    def of(block: FloatArray) -> float:
+        finite = block[np.isfinite(block)]
+        return statistic(finite) if finite.size >= _LEAST_FINITE * block.size else math.nan
+
     edges = [np.linspace(0, n, n // _BLOCK_PX + 1).astype(int) for n in values.shape]
     found = np.array(
         [
-            [statistic(values[top:bottom, left:right]) for left, right in pairwise(edges[1].tolist())]
+            [of(values[top:bottom, left:right]) for left, right in pairwise(edges[1].tolist())]
             for top, bottom in pairwise(edges[0].tolist())
         ]
     )
+    nearest = ndimage.distance_transform_edt(np.isnan(found), return_distances=False, return_indices=True)
+    found = found[tuple(nearest)]
     places = [(np.arange(n) - 0.5 * (e[0] + e[1])) / (e[1] - e[0]) for n, e in zip(values.shape, edges, strict=True)]
     at = np.meshgrid(*places, indexing="ij")
     smooth: FloatArray = ndimage.map_coordinates(ndimage.median_filter(found, 3), at, order=1, mode="nearest")

@@ -33,10 +33,11 @@ CAMERA = StarCamera(640, 480, math.radians(60.0 / 3600.0))
 SKY = random_sky(30_000)
 
 
-def fits_bytes(values, bitpix, bzero=0.0):
+def fits_bytes(values, bitpix, bzero=0.0, blank=0):
     """A FITS file of one image, by the standard: cards of 80, blocks of 2880 bytes, big-endian."""
     cards = ["SIMPLE  =                    T", f"BITPIX  = {bitpix:20d}", "NAXIS   =                    2"]
-    cards += [f"NAXIS1  = {values.shape[1]:20d}", f"NAXIS2  = {values.shape[0]:20d}", f"BZERO   = {bzero:20.1f}", "END"]
+    cards += [f"NAXIS1  = {values.shape[1]:20d}", f"NAXIS2  = {values.shape[0]:20d}", f"BZERO   = {bzero:20.1f}"]
+    cards += [f"BLANK   = {blank:20d}", "END"] if blank else ["END"]
     header = "".join(card.ljust(80) for card in cards).encode()
     kind = {8: ">u1", 16: ">i2", -32: ">f4"}[bitpix]
     data = (values - bzero).astype(kind).tobytes()
@@ -51,6 +52,19 @@ class TestFiles:
         (tmp_path / "a.fits").write_bytes(fits_bytes(values[::-1].astype(np.float64), 16, 32768.0))
         for suffix in ("png", "tiff", "fits"):
             np.testing.assert_array_equal(read_picture(tmp_path / f"a.{suffix}"), values)
+
+    def test_masked_pixels_of_fits_files_are_nan(self, tmp_path):
+        """NaN of fractions, the value of BLANK of whole numbers."""
+        values = np.random.default_rng(0).integers(0, 30_000, (70, 90)).astype(np.float64)
+        values[:20, 10:30] = np.nan
+        (tmp_path / "a.fits").write_bytes(fits_bytes(values[::-1], -32))
+        (tmp_path / "b.fits").write_bytes(fits_bytes(np.nan_to_num(values, nan=-9.0)[::-1], 16, blank=-9))
+        for name in "ab":
+            np.testing.assert_array_equal(read_picture(tmp_path / f"{name}.fits"), values)
+        values[:50] = np.nan
+        (tmp_path / "a.fits").write_bytes(fits_bytes(values, -32))
+        with pytest.raises(InputError, match="found 29 % finite pixels, expected half"):
+            read_picture(tmp_path / "a.fits")
 
     def test_colours(self, tmp_path):
         values = np.random.default_rng(0).integers(0, 255, (70, 90, 4)).astype(np.uint8)
@@ -82,7 +96,7 @@ class TestFiles:
         for name, said in (
             ("none.png", "does not exist"),
             ("no.png", "no picture that can be read"),
-            ("small.png", "expected 64 × 64 finite pixels"),
+            ("small.png", "expected 64 × 64 pixels"),
             ("cube.fits", "no image in two dimensions"),
         ):
             with pytest.raises(InputError, match=said):
@@ -113,6 +127,23 @@ class TestLights:
         empty = random_sky(4)
         picture, _, _ = photograph(empty, CAMERA, np.eye(3), np.random.default_rng(1), **HARD | {"hot": 200})
         assert len(find_picture_stars(picture)) < 20
+
+    def test_masked_pixels(self):
+        """Lights clear of the mask are the same ones at the same places; none is in the mask or at its edge."""
+        picture, _, _ = photograph(SKY, CAMERA, np.eye(3), np.random.default_rng(5))
+        mask = np.zeros(picture.shape, dtype=bool)
+        mask[:150, 300:520] = True
+        mask[np.random.default_rng(6).uniform(size=mask.shape) < 0.001] = True
+        whole, masked = find_picture_stars(picture), find_picture_stars(np.where(mask, np.nan, picture))
+        near = cKDTree(np.argwhere(mask)[:, ::-1] + 0.5)
+
+        def clear_px(lights):
+            return near.query(lights.points_px * [1.0, -1.0] + [0.0, 480.0])[0]
+
+        assert clear_px(masked).min() > 2.0
+        bright = whole.points_px[clear_px(whole) > 8.0]
+        assert len(bright) > 0.6 * len(whole)
+        assert cKDTree(masked.points_px).query(bright)[0].max() < 0.05
 
     def test_a_dark_picture(self):
         rng = np.random.default_rng(2)
