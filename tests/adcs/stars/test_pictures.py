@@ -443,7 +443,7 @@ class TestCommand:
         assert main([*arguments, "--json"]) == 0
         (row,) = json.loads(capsys.readouterr().out)["pictures"]
         ra, dec = row["ra_deg"], row["dec_deg"]
-        assert main([*arguments, "--json", "--near", f"{ra + 0.5}", f"{dec}", "1"]) == 0
+        assert main([*arguments, "--json", "--near", f"{ra - 359.5}", f"{dec}", "1"]) == 0
         (same,) = json.loads(capsys.readouterr().out)["pictures"]
         assert (same["ra_deg"], same["dec_deg"]) == pytest.approx((ra, dec), abs=1e-3)
         assert main([*arguments, "--near", f"{ra + 180.0 - 360.0 * (ra > 180.0)}", f"{-dec}", "1"]) == 0
