@@ -143,7 +143,7 @@ def _pictures(
     lens: Path | None,
 ) -> None:
     from adcs.plots.stars import picture_figure
-    from adcs.stars.identification import NoFix
+    from adcs.stars.identification import NoFix, StarFix
     from adcs.stars.lens import calibrate_lens, lens_text, read_lens
     from adcs.stars.wcs import wcs_header
     from arrays.io.outputs import refuse_file, write_files
@@ -153,6 +153,7 @@ def _pictures(
     refuse_file(wcs, "--wcs")
     off = None if dark is None else adcs.read_picture(dark)
     rows, solved = [], []
+    last: StarFix | None = None
     for path in paths:
         picture = adcs.read_picture(path)
         if known_lens is not None:
@@ -168,7 +169,9 @@ def _pictures(
                 near=near,
                 lens=known_lens,
                 dark=off,
+                last=last,
             )
+        last = found if isinstance(found, StarFix) else last
         took_ms = 1e3 * (time.perf_counter() - began)
         row: dict[str, Any] = {"file": str(path), "solved": not isinstance(found, NoFix)}
         if isinstance(found, NoFix):

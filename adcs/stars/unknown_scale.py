@@ -6,9 +6,10 @@ See docs/theory/star-identification.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +26,7 @@ from arrays.typing import FloatArray
 _STRONG_RAD = math.radians(25.0)  # field of view from which on a lens may bend the corners strongly
 _STARS = 100  # number of the brightest lights in use; the catalogue has no fainter stars
 _WIDEST_TOLERANCE = 0.1
+_SAME_LENS = LensPrior(scale=3e-3, bent=3e-3)  # of the picture before, which heat and focus change a little
 _FIRST_FIELD_RAD, _LAST_FIELD_RAD = math.radians(3.0), math.radians(45.0)
 # Fields from corner to corner of equidistant lenses; the angles of a lens do not scale as those of another one.
 _FIRST_WIDE_RAD, _LAST_WIDE_RAD, _WIDE_FIELDS = math.radians(45.0), math.radians(100.0), 9
@@ -40,6 +42,7 @@ def solve_photograph(
     near: SkyCap = WHOLE_SKY,
     lens: KnownLens | None = None,
     dark: ArrayLike | None = None,
+    last: StarFix | None = None,
 ) -> tuple[PictureStars, StarFix | NoFix]:
     """Identify attitude, scale and stars of a photograph of the sky.
 
@@ -63,6 +66,9 @@ def solve_photograph(
         Lens of the camera, such as from ``adcs.stars.lens.read_lens``, in place of ``rad_per_px``.
     dark : array_like, shape (height, width), optional
         Picture of the camera without light, which is subtracted.
+    last : StarFix, optional
+        Fix of the picture before in a sequence: its lens and the sky around its centre are tried first. It has no
+        effect together with ``near`` or ``lens``.
 
     Returns
     -------
@@ -102,6 +108,7 @@ def solve_photograph(
         noise_px=noise_px,
         near=near,
         lens=lens,
+        last=last,
     )
     return stars, found
 
@@ -118,13 +125,14 @@ def identify_at_unknown_scale(
     noise_px: float = 0.5,
     near: SkyCap = WHOLE_SKY,
     lens: KnownLens | None = None,
+    last: StarFix | None = None,
 ) -> StarFix | NoFix:
     """Identify attitude, scale and stars of a picture.
 
     ``rad_per_px``: scale at the centre with the relative error ``tolerance``, at most 0.1; by default fields of 3 to
     100° from corner to corner are tried, the widest with an equidistant lens. ``noise_px``: standard deviation of a
     star's place, with errors of the lens. ``near``: part of the sky in which the picture's centre is. ``lens``: known
-    lens, in place of ``rad_per_px``.
+    lens, in place of ``rad_per_px``. ``last``: fix of the picture before, see :func:`solve_photograph`.
     """
     check_positive(tolerance=tolerance, noise_px=noise_px)
     if tolerance > _WIDEST_TOLERANCE:
@@ -137,6 +145,47 @@ def identify_at_unknown_scale(
         cameras, prior = [lens.camera], lens.prior
     else:
         cameras, prior = _cameras(width_px, height_px, rad_per_px, tolerance)
+    tracked = last is not None and lens is None and near.share >= 1.0
+    for fix, matcher in chain(
+        _near_last(catalogue, width_px, height_px, points, magnitudes, noise_px, last if tracked else None),
+        _of_cameras(catalogue, cameras, points, magnitudes, prior, noise_px, near),
+    ):
+        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(cameras) + tracked):
+            if lens is None and matcher.camera.diagonal_rad > _STRONG_RAD:
+                fix = matcher.refine_lens(points, magnitudes, fix)
+            return replace(fix, stars=np.stack([brightest[fix.stars[:, 0]], fix.stars[:, 1]], axis=1))
+    where = "" if near.share >= 1.0 else f"not solved near {near}: "
+    return NoFix(f"{where}no scale of {len(cameras)} explains the {len(points)} brightest lights, mirrored or not")
+
+
+def _near_last(
+    catalogue: StarCatalogue,
+    width_px: int,
+    height_px: int,
+    points: FloatArray,
+    magnitudes: FloatArray,
+    noise_px: float,
+    last: StarFix | None,
+) -> Iterator[tuple[StarFix | NoFix, StarMatcher]]:
+    """Identify a picture with the lens of the picture before, near its centre."""
+    if last is None or (last.pose.camera.width_px, last.pose.camera.height_px) != (width_px, height_px):
+        return
+    camera = last.pose.camera
+    around = SkyCap(-last.R_catalogue_from_frame[:, 2], camera.diagonal_rad)
+    matcher = StarMatcher.of(catalogue, camera, noise_px, around)
+    yield matcher.identify(points, magnitudes, _SAME_LENS, mirrored=last.mirrored), matcher
+
+
+def _of_cameras(
+    catalogue: StarCatalogue,
+    cameras: list[StarCamera],
+    points: FloatArray,
+    magnitudes: FloatArray,
+    prior: LensPrior,
+    noise_px: float,
+    near: SkyCap,
+) -> Iterator[tuple[StarFix | NoFix, StarMatcher]]:
+    """Identify a picture with each camera, then mirrored."""
     ranked = ranked_triangles(catalogue)
 
     @cache
@@ -144,13 +193,7 @@ def identify_at_unknown_scale(
         return StarMatcher.of(catalogue, camera, noise_px, near, ranked)
 
     for mirrored, camera in product((False, True), cameras):
-        fix = matcher_of(camera).identify(points, magnitudes, prior, mirrored=mirrored)
-        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(cameras)):
-            if lens is None and camera.diagonal_rad > _STRONG_RAD:
-                fix = matcher_of(camera).refine_lens(points, magnitudes, fix)
-            return replace(fix, stars=np.stack([brightest[fix.stars[:, 0]], fix.stars[:, 1]], axis=1))
-    where = "" if near.share >= 1.0 else f"not solved near {near}: "
-    return NoFix(f"{where}no scale of {len(cameras)} explains the {len(points)} brightest lights, mirrored or not")
+        yield matcher_of(camera).identify(points, magnitudes, prior, mirrored=mirrored), matcher_of(camera)
 
 
 def _cameras(

@@ -258,6 +258,21 @@ class TestUnknownScale:
             solve_photograph(np.zeros((100, 100)), SKY, dark=np.zeros((10, 10)))
 
 
+class TestSequence:
+    def test_the_last_picture_helps(self, monkeypatch):
+        """The fix is the same to a hundredth of a pixel without a search of the whole sky, and right after a leap."""
+        turns = Rotation.from_rotvec([[0.0, 0.0, 0.0], [0.03, 0.02, 0.1], [1.0, 2.0, 0.0]])
+        turns = turns * Rotation.random(random_state=8)
+        pictures = [photograph(SKY, CAMERA, R, np.random.default_rng(1))[0] for R in turns.as_matrix()]
+        (_, first), (_, second), (_, third) = (solve_photograph(picture, SKY) for picture in pictures)
+        with monkeypatch.context() as patch:
+            patch.setattr("adcs.stars.unknown_scale.ranked_triangles", None)
+            _, tracked = solve_photograph(pictures[1], SKY, last=first)
+        for found, expected in ((tracked, second), (solve_photograph(pictures[2], SKY, last=first)[1], third)):
+            turn = Rotation.from_matrix(found.R_catalogue_from_frame.T @ expected.R_catalogue_from_frame).magnitude()
+            assert turn < 0.01 * CAMERA.rad_per_px
+
+
 class TestHipparcos:
     def test_stars_of_any_almanac(self):
         """Sirius, Vega and Polaris in J2000, and Barnard's star, which moves by 10.36 arc seconds a year."""
