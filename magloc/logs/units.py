@@ -45,6 +45,7 @@ _ENDINGS = (
     (r"_pa", "Pa"),
     (r"temperature|_cel[cs]ius", "degC"),
     (r"_(?:us|usec)", "us"),
+    (r"_ms", "ms"),
     (r"_(?:m|meter)", "m"),
     (r"_s", "s"),
 )
