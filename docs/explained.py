@@ -31,6 +31,7 @@ EXPLAINED = {
     " arrays.cross arrays.cube arrays.hexagon arrays.axial arrays.grid arrays.mesh_of",
     "reading-data": "magloc.read_readings magloc.Readings magloc.read_truth magloc.Truth arrays.InputError"
     " arrays.LogColumns arrays.ValidRows",
+    "robot-logs": "magloc.read_log magloc.Log magloc.LogChannel",
     "stated-uncertainty": "arrays.PoseUncertainty",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
     " magloc.SourcePrior magloc.plots.fixes",

@@ -37,6 +37,9 @@ from magloc.localization.line_ranging import distance_along_line as distance_alo
 from magloc.localization.line_ranging import fit_source_line as fit_source_line
 from magloc.localization.locator import Locator as Locator
 from magloc.localization.locator import locate as locate
+from magloc.logs.channels import Log as Log
+from magloc.logs.channels import LogChannel as LogChannel
+from magloc.logs.read import read_log as read_log
 from magloc.navigation.measured_motion import MeasuredMotion as MeasuredMotion
 from magloc.readings import Readings as Readings
 from magloc.readings import read_readings as read_readings

