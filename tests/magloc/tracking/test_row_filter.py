@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -167,16 +167,20 @@ def minimise(at: Case, i: int, bends: bool, shares: FloatArray) -> Fit:
     Q, R = np.linalg.qr(np.concatenate([of_errors[:, s:d], LEAST_SHARE * np.eye(d - s)]))
     M_errors = bends * np.linalg.solve(R, Q[: len(J)].T)
 
+    at_prediction = h(nowhere)
+
     def normal(zeta: FloatArray) -> FloatArray:
-        seen = zeta[:s] + M @ (h(zeta) - h(nowhere) - J @ zeta[:s])
-        return np.concatenate([seen, zeta[s:d] + M_errors @ (h(zeta) - h(nowhere) - J @ seen), zeta[d:]])
+        change = h(zeta) - at_prediction
+        seen = zeta[:s] + M @ (change - J @ zeta[:s])
+        return np.concatenate([seen, zeta[s:d] + M_errors @ (change - J @ seen), zeta[d:]])
 
     def bent(zeta: FloatArray) -> FloatArray:
         return np.concatenate([normal(zeta)[:s], zeta[s:]])
 
     def misfit(zeta: FloatArray) -> FloatArray:
-        left = row.z - h(zeta, row) - row.effect @ x[errors] - of_errors @ bent(zeta)
-        return np.concatenate([left, -normal(zeta)])
+        standard = normal(zeta)
+        of_noise = of_errors @ np.concatenate([standard[:s], zeta[s:]])
+        return np.concatenate([row.z - h(zeta, row) - row.effect @ x[errors] - of_noise, -standard])
 
     zeta = least_squares(misfit, nowhere, lambda zeta: slope(misfit, zeta), xtol=1e-12, ftol=1e-15, gtol=1e-12).x
     found, H, D = misfit(zeta), -slope(misfit, zeta), slope(normal, zeta)
@@ -401,26 +405,85 @@ def slope(function: Callable[[FloatArray], FloatArray], at: FloatArray) -> Float
     return np.stack([(function(at + d) - function(at - d)) / 2e-5 for d in steps], axis=1)
 
 
+@cache
+def board_optima(n_sources: int) -> tuple[Board, list[OptimizeResult]]:
+    """SciPy's optimum of each prediction, the same for all instruction sets; ``jac`` by central differences."""
+    board, fits = Board(n_sources, n_sources), []
+    for x, S in zip(board.gaussians.x, board.gaussians.S, strict=True):
+
+        def misfit(zeta: FloatArray, x: FloatArray = x, S: FloatArray = S) -> FloatArray:
+            return np.concatenate([board.z - board.h(board.retract(x, S @ zeta)), -zeta])
+
+        fit = least_squares(misfit, np.zeros(len(x)), jac="3-point", xtol=1e-12, ftol=1e-14, gtol=1e-12)
+        fits.append(OptimizeResult(fit, jac=slope(misfit, fit.x)))
+    return board, fits
+
+
+@dataclass(frozen=True)
+class SmoothedRows:
+    """Rows of a board to smooth, and the Gaussians of all states and readings together, one of each track."""
+
+    board: Board
+    tracks: FloatArray
+    prior: Gaussians
+    steps: core.Problem
+    rows: Rows
+    gaussians: list[tuple[FloatArray, ...]]
+    """Mean (m N,) and covariance (m N, m N) given the readings, and what is left of these (m k,) and its covariance."""
+
+
+@cache
+def smoothed_rows(n_sources: int) -> SmoothedRows:
+    board, motion, m, dt_s = Board(n_sources, 40 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5), 4, 0.05
+    rng, n, k = np.random.default_rng(n_sources), n_sources * board.n, len(board.z)
+    N = n + 3
+    tracks = board.gaussians.x[:, None, :n] * (1.0 + 0.01 * rng.normal(size=(2, m, n)))
+    readings = board.exact + rng.normal(size=(m, k))
+    S = board.gaussians.S
+    prior = replace(board.gaussians, x=0.3 * np.linalg.norm(S, axis=2) * rng.normal(size=(2, N)))
+    kept, added = np.full((1, 3), 0.9), np.full((1, 3), 1e-6)
+    steps = row_filter.steps_problem(motion, [dt_s], np.zeros(m, dtype=np.intp), (kept, added))
+    gaussians = []
+    for c, track in enumerate(np.pad(tracks, ((0, 0), (0, 0), (0, 3)))):
+        # B (e_0, e_1, ...) = (e_0, shift_1 + noise_1, ...)
+        B, H = np.eye(m * N), np.zeros((m * k, m * N))
+        shift, D = np.zeros(m * N), np.zeros((m * N, m * N))
+        shift[:N], D[:N, :N] = prior.x[c], S[c] @ S[c].T
+        z = readings.ravel() - np.concatenate([board.h(x) for x in track])
+        L = [slope(lambda e, x=x: board.retract(x, e), np.zeros(N)) for x in track]
+        for row, x in enumerate(track):
+            at = slice(N * row, N * (row + 1))
+            H[k * row : k * (row + 1), at] = slope(lambda e, x=x: board.h(board.retract(x, e)), np.zeros(N))
+            if not row:
+                continue
+            F, Q, moved = np.diag(np.r_[np.zeros(n), kept[0]]), np.diag(np.r_[np.zeros(n), added[0] ** 2]), x.copy()
+            for source in (slice(i, i + 12) for i in range(0, n, 12)):
+                moved[source], F[source, source], S_q = motion.step(track[row - 1, source], dt_s)
+                Q[source, source] = S_q @ S_q.T
+            B[at, N * (row - 1) : N * row] = -np.linalg.solve(L[row], F @ L[row - 1])
+            D[at, at] = np.linalg.solve(L[row], np.linalg.solve(L[row], Q).T)
+            shift[at] = board.coordinates(x, moved)
+        mean, C = np.linalg.solve(B, shift), np.linalg.solve(B, np.linalg.solve(B, D).T)
+        left, covariance_z = z - H @ mean, np.eye(m * k) + H @ C @ H.T
+        gain = np.linalg.solve(covariance_z, H @ C).T
+        gaussians.append((mean + gain @ left, C - gain @ H @ C, left, covariance_z))
+    return SmoothedRows(board, tracks, prior, steps, board.repeat(readings), gaussians)
+
+
 @all_instruction_sets
 @pytest.mark.parametrize("n_sources", [1, 2, 3])
 class TestSeveralSources:
     """Against the formulas of the chart, minimised by SciPy, with derivatives by differences."""
 
     def test_update(self, n_sources: int) -> None:
-        board = Board(n_sources, n_sources)
+        board, fits = board_optima(n_sources)
         found = row_filter.update(board.gaussians, board.rows, linearisations=True, innovation=True)
         assert found.converged.all()
         assert found.standardised is not None
         sensor_chi2 = np.vecdot(found.standardised, found.standardised)
         assert found.innovation is not None
-        for c, (x, S) in enumerate(zip(board.gaussians.x, board.gaussians.S, strict=True)):
-
-            def misfit(zeta: FloatArray, x: FloatArray = x, S: FloatArray = S) -> FloatArray:
-                return np.concatenate([board.z - board.h(board.retract(x, S @ zeta)), -zeta])
-
-            fit = least_squares(misfit, np.zeros(len(x)), jac="3-point", xtol=1e-12, ftol=1e-14, gtol=1e-12)
-            J = -slope(misfit, fit.x)
-            k, there = len(board.z), board.retract(x, S @ fit.x)
+        for c, (x, S, fit) in enumerate(zip(board.gaussians.x, board.gaussians.S, fits, strict=True)):
+            J, k, there = -fit.jac, len(board.z), board.retract(x, S @ fit.x)
             assert found.nis[c] == pytest.approx(2.0 * fit.cost, abs=1e-5)
             assert found.chi2[c] == pytest.approx(float(np.sum(fit.fun[:k] ** 2)), abs=1e-2)
             log_N = float(np.linalg.slogdet(J.T @ J)[1])
@@ -504,44 +567,15 @@ class TestSeveralSources:
 
     def test_smoothed_rows(self, n_sources: int) -> None:
         """Against the Gaussian of all states and readings together, conditioned on the readings."""
-        board, motion, m, dt_s = Board(n_sources, 40 + n_sources), OrnsteinUhlenbeck(0.3, 1.8, 1.5), 4, 0.05
-        rng, n, k = np.random.default_rng(n_sources), n_sources * board.n, len(board.z)
-        N = n + 3
-        tracks = board.gaussians.x[:, None, :n] * (1.0 + 0.01 * rng.normal(size=(2, m, n)))
-        readings = board.exact + rng.normal(size=(m, k))
-        S = board.gaussians.S
-        prior = replace(board.gaussians, x=0.3 * np.linalg.norm(S, axis=2) * rng.normal(size=(2, N)))
-        kept, added = np.full((1, 3), 0.9), np.full((1, 3), 1e-6)
-        steps = row_filter.steps_problem(motion, [dt_s], np.zeros(m, dtype=np.intp), (kept, added))
-        found = row_filter.smooth(tracks, prior, steps, board.repeat(readings))
-        for c, track in enumerate(np.pad(tracks, ((0, 0), (0, 0), (0, 3)))):
-            # B (e_0, e_1, ...) = (e_0, shift_1 + noise_1, ...)
-            B, H = np.eye(m * N), np.zeros((m * k, m * N))
-            shift, D = np.zeros(m * N), np.zeros((m * N, m * N))
-            shift[:N], D[:N, :N] = prior.x[c], S[c] @ S[c].T
-            z = readings.ravel() - np.concatenate([board.h(x) for x in track])
-            L = [slope(lambda e, x=x: board.retract(x, e), np.zeros(N)) for x in track]
-            for row, x in enumerate(track):
-                at = slice(N * row, N * (row + 1))
-                H[k * row : k * (row + 1), at] = slope(lambda e, x=x: board.h(board.retract(x, e)), np.zeros(N))
-                if not row:
-                    continue
-                F, Q, moved = np.diag(np.r_[np.zeros(n), kept[0]]), np.diag(np.r_[np.zeros(n), added[0] ** 2]), x.copy()
-                for source in (slice(i, i + 12) for i in range(0, n, 12)):
-                    moved[source], F[source, source], S_q = motion.step(track[row - 1, source], dt_s)
-                    Q[source, source] = S_q @ S_q.T
-                B[at, N * (row - 1) : N * row] = -np.linalg.solve(L[row], F @ L[row - 1])
-                D[at, at] = np.linalg.solve(L[row], np.linalg.solve(L[row], Q).T)
-                shift[at] = board.coordinates(x, moved)
-            mean, C = np.linalg.solve(B, shift), np.linalg.solve(B, np.linalg.solve(B, D).T)
-            left, covariance_z = z - H @ mean, np.eye(m * k) + H @ C @ H.T
-            gain = np.linalg.solve(covariance_z, H @ C).T
-            expected, after = mean + gain @ left, C - gain @ H @ C
+        at = smoothed_rows(n_sources)
+        found = row_filter.smooth(at.tracks, at.prior, at.steps, at.rows)
+        k, N = len(at.board.z), at.prior.x.shape[1]
+        for c, (expected, after, left, covariance_z) in enumerate(at.gaussians):
             sigma = np.sqrt(np.diagonal(after))
             offsets = np.pad(found.offsets[c], ((0, 0), (0, 3)))
             offsets[-1] = found.last.x[c]
-            error = ((offsets.ravel() - expected) / sigma).reshape(m, N)
-            assert np.abs(error[:, :n]).max() < 1e-4
+            error = ((offsets.ravel() - expected) / sigma).reshape(-1, N)
+            assert np.abs(error[:, :-3]).max() < 1e-4
             assert np.abs(error[-1]).max() < 1e-4
             unit = np.outer(sigma[-N:], sigma[-N:])
             np.testing.assert_allclose(covariance(found.last.S[c]) / unit, after[-N:, -N:] / unit, atol=1e-4)
