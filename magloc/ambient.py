@@ -108,6 +108,13 @@ def _turns(readings: Readings) -> bool:
     return bool((abs(rotations @ rotations[0]) < 1.0 - 1e-7).any())
 
 
+def modulus_at(place: Place) -> float:
+    """Return the modulus of the geomagnetic field at a place and date [T]."""
+    import numpy as np
+
+    return float(np.linalg.norm(_of_model(place)[0]))
+
+
 def _of_model(place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     import numpy as np
 

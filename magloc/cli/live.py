@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from arrays.io.errors import LARGEST, naming, naming_options
+from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, note, refuse_outside
 from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_place
@@ -22,6 +22,45 @@ if TYPE_CHECKING:
 
 _SWITCH_S = 5e-4
 """Time after which a thread of the page yields to the tracker."""
+
+
+@Parameter(name="*", group="Live calibration")
+@dataclass(frozen=True)
+class TurningOptions:
+    """Calibration of vector sensors while they are turned in a uniform field.
+
+    Parameters
+    ----------
+    calibrate : bool
+        Calibrate in place of tracking: a JSON line a second with the directions covered, the turn that is missing and
+        the standard deviations. It ends when they are enough, and writes --out-array.
+    out_array : Path, optional
+        Array file to write with the calibrations.
+    modulus_nT : float, optional
+        Modulus of the field [nT]; by default that at --place and --date, or else the mean gain of the sensors stays as
+        in the array file.
+    goal_nT : float, optional
+        Standard deviation of the offsets that is enough [nT]; by default a thousandth of the modulus.
+    """
+
+    calibrate: Flag = False
+    out_array: Path | None = None
+    modulus_nT: Annotated[float | None, Parameter(name="--modulus-nT")] = None
+    goal_nT: Annotated[float | None, Parameter(name="--goal-nT")] = None
+
+    def check(self, *, out: Path | None, rest_s: float, sources: str | None) -> None:
+        """Refuse options that contradict each other."""
+        refuse_unwritable(self.out_array, "--out-array", ".toml")
+        refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", modulus_nT=self.modulus_nT, goal_nT=self.goal_nT)
+        own = {"--out-array": self.out_array, "--modulus-nT": self.modulus_nT, "--goal-nT": self.goal_nT}
+        others = {"--out": out, "--rest-s": rest_s or None, "--sources": sources}
+        for name, value in (others if self.calibrate else own).items():
+            if value is not None:
+                found = "together with" if self.calibrate else "without"
+                expected = "one of them" if self.calibrate else "both"
+                raise InputError(f"{name}: found {found} --calibrate, expected {expected}.")
+        if self.calibrate and self.out_array is None:
+            raise InputError("--calibrate: found no --out-array, expected the array file to write.")
 
 
 @Parameter(name="*", group="Live page")
@@ -51,6 +90,7 @@ def live(
     rest_s: float = 0.0,
     replay_speed: float = 1.0,
     out: Path | None = None,
+    turning: TurningOptions = TurningOptions(),
     page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
@@ -77,6 +117,8 @@ def live(
     out : Path, optional
         CSV file to write, with the columns of track.csv of magloc track --out: a row for every line and source, as soon
         as it is known.
+    turning : TurningOptions
+        Calibration in place of tracking.
     page : PageOptions
         Page that shows the source.
     known : KnownOptions
@@ -91,7 +133,14 @@ def live(
     refuse_outside(0.0, LARGEST, "0 or a positive number", rest_s=rest_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
     refuse_unwritable(out, "--out", ".csv")
+    turning.check(out=out, rest_s=rest_s, sources=motion.sources)
     used = known.array(array)
+    if turning.calibrate:
+        from magloc.cli.calibration.live_turning import calibrate_live
+
+        with naming_place(), naming(str(array), readings=source, time_s=source):
+            calibrate_live(used, source, replay_speed, turning, known.where, page)
+        return
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)
     with ExitStack() as open_page:

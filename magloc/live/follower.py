@@ -13,10 +13,10 @@ import msgspec
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.io.errors import InputError, check_not_negative
+from arrays.io.errors import check_not_negative
 from magloc.ambient import Place, in_world_field, with_ambient_field
 from magloc.live.rest import RestBackground, check_rest
-from magloc.live.rows import RowParser
+from magloc.live.rows import RowParser, rows_of_stream
 from magloc.live.tally import Clock, Pace, Tally
 from magloc.live.transports import STANDARD_INPUT, Stream, open_stream, sender_waits
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
@@ -24,7 +24,7 @@ from magloc.measurement.differences import predicted_channels, suitable_dipole
 from magloc.measurement.plausibility import FEWEST_ROWS, warn_of_array, warn_of_record
 from magloc.measurement.pose import with_stated_pose
 from magloc.measurement.rows import concatenate_readings
-from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
+from magloc.readings import Readings, log_format, without_saturated
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.tracker import SourcesTracker
@@ -211,14 +211,8 @@ class Follower:
         pace = None if waits else Pace(stream.name)
         if not waits:
             _LOG.info(f"{stream.name}: waiting for rows")
-        for batch in stream.batches:
-            self.tally.drop(batch.dropped, stream.name)
-            for readings in parser.parse(batch.lines, batch.sender):
-                stream.accept(batch.sender)
-                yield from self._track_rows(readings, batch.arrival_s, pace)
-            if parser.has_header_of(batch.sender):
-                stream.accept(batch.sender)
-        self._check_not_empty(parser, stream.name)
+        for readings, arrival_s in rows_of_stream(stream, parser, self.tally):
+            yield from self._track_rows(readings, arrival_s, pace)
 
     def _follow_rows(self, source: Iterable[Readings | Mapping[str, float | None] | str]) -> Generator[LivePoint]:
         parser = RowParser(self.array, "the rows", self.tally, self._sensors)
@@ -231,18 +225,7 @@ class Follower:
             for readings in parser.parse([line]):
                 yield from self._track_rows(readings, arrival_s)
         if self.tally.garbled:
-            self._check_not_empty(parser, "the rows")
-
-    def _check_not_empty(self, parser: RowParser, name: str) -> None:
-        """Raise InputError if a stream ends without a row."""
-        if self.tally.rows:
-            return
-        if self.tally.garbled:
-            fault = parser.fault.rstrip(".")
-            raise InputError(f"{name}: found only garbled lines ({self.tally.garbled}), expected rows ({fault}).")
-        if parser.has_header:
-            raise InputError(f"{name}, line 1: found a header without rows, expected a row below it.")
-        raise InputError(f"{name}: found nothing, expected {EXPECTED_HEADER}.")
+            parser.check_not_empty()
 
     def _track_rows(self, readings: Readings, arrival_s: float, pace: Pace | None = None) -> Generator[LivePoint]:
         """Yield the points of new rows; with a pace, skip rows that cannot be tracked in time."""

@@ -17,6 +17,7 @@ from arrays.io.errors import InputError
 from arrays.logs.format import without_dummies
 from arrays.typing import FloatArray
 from magloc.live.tally import Tally
+from magloc.live.transports import Stream
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, readings_of_checked, readings_of_table
 
 _LOG = logging.getLogger(__name__)
@@ -24,6 +25,18 @@ _LINES_WITHOUT_HEADER = 100
 _RECENT = 100  # rows that decide whether a number is a dummy value
 _MOST_HEADERS = 64
 _WHITESPACE = "\ufeff \r\t"
+
+
+def rows_of_stream(stream: Stream, parser: RowParser, tally: Tally) -> Iterator[tuple[Readings, float]]:
+    """Yield the rows of a stream and the time of their arrival [s]; at its end, refuse a stream without rows."""
+    for batch in stream.batches:
+        tally.drop(batch.dropped, stream.name)
+        for readings in parser.parse(batch.lines, batch.sender):
+            stream.accept(batch.sender)
+            yield readings, batch.arrival_s
+        if parser.has_header_of(batch.sender):
+            stream.accept(batch.sender)
+    parser.check_not_empty()
 
 
 class GarbledError(ValueError):
@@ -102,6 +115,19 @@ class RowParser:
     def _header(self) -> _Header | None:
         """Header that applies to the rows of the present sender."""
         return self._headers.get(self._sender, self._first)
+
+    def check_not_empty(self) -> None:
+        """Raise InputError if the stream has ended without a row."""
+        if self._tally.rows:
+            return
+        if self._tally.garbled:
+            fault = self.fault.rstrip(".")
+            raise InputError(
+                f"{self._name}: found only garbled lines ({self._tally.garbled}), expected rows ({fault})."
+            )
+        if self.has_header:
+            raise InputError(f"{self._name}, line 1: found a header without rows, expected a row below it.")
+        raise InputError(f"{self._name}: found nothing, expected {EXPECTED_HEADER}.")
 
     def parse(self, lines: Sequence[bytes], sender: Hashable = None) -> Iterator[Readings]:
         """Yield the rows of the next lines of a sender, in order, as many as possible at once."""
