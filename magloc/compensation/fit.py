@@ -311,7 +311,7 @@ def _nuisances(
 
 
 def _coarse_lag(rows: CalibrationRows, terms: PlatformTerms, background: Background) -> float:
-    """Return the lag whose linear fit is the best, without those that are no better than none."""
+    """Return the lag with the best linear fit; 0 if no lag fits clearly better."""
     steps = round(_LARGEST_LAG_S / _LAG_STEP_S)
     lags = _LAG_STEP_S * np.array(sorted(range(-steps, steps + 1), key=abs))
     start, costs = np.zeros(len(terms.names)), []
