@@ -260,7 +260,7 @@ def find_own_fields(
     times = np.asarray(time_s, dtype=np.float64)
     n = len(times)
     if times.ndim != 1 or n < 2 or not (np.diff(times) > 0.0).all():
-        raise ValueError("Input time_s must be two ascending instants or more; instead received others.")
+        raise ValueError("Input time_s must ascend and have at least two instants; instead it does not.")
     readings, gyro = np.asarray(readings_T, dtype=np.float64), np.asarray(gyro_rad_s, dtype=np.float64)
     if array.channel_is_scalar.any():
         raise ValueError("Input array must have vector magnetometers only; instead received a scalar one.")

@@ -40,7 +40,7 @@ def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
 
 @lru_cache(maxsize=16)
 def _seconds_of_minute(minute: str, day_first: bool | None) -> float | None:
-    """Return the seconds of the begin of a minute, cached because many rows share it; None if it is none."""
+    """Return the seconds of the begin of a minute, cached because many rows share it; None if the text is no minute."""
     try:
         return float(_seconds_of_instant("", f"{minute}:00", day_first))
     except InputError:
