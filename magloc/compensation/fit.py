@@ -264,7 +264,7 @@ class LinearProblem:
         return cls(rows, samples, columns, field, effect, errors.shape[1], unknowns)
 
     def effect_at(self, unknowns: FloatArray) -> FloatArray:
-        """Return the effect [T] of the platform at some unknowns, in first order; the effect of a gradient is left out."""
+        """Return the effect [T] of the platform at some unknowns, in first order, without that of a gradient."""
         change = unknowns - self.unknowns
         if self.rows.place_m is not None:
             change[len(change) - 3 - (not self.rows.is_own) :][:3] = 0.0
