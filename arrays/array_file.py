@@ -13,8 +13,8 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     offset_uncertainty_nT = 0.5     # optional, unknown field fixed to the array, 1 sigma per axis
     flicker_nT = 0.01               # optional, 1/f noise: 1 sigma in every decade of frequency
     drift_nT_rth = 0.1              # optional, random walk of the offset: 1 sigma after an hour
-    induced_uncertainty = 1e-4      # optional, what the ambient field induces in the carrier, over it: 1 sigma
-    eddy_uncertainty_s = 1e-4       # optional, the same over the field's derivative in the array's axes
+    induced_uncertainty = 1e-4      # optional, induced field of the carrier over the ambient field: 1 sigma
+    eddy_uncertainty_s = 1e-4       # optional, field of eddy currents over the ambient field's derivative
 
     [[sensor]]                      # in place of geometry, its size, and the keys from kind to eddy_uncertainty_s
     id = "s1"
@@ -36,7 +36,7 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
     offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
 
-    [defaults]                      # optional, what every [[sensor]] has that does not say otherwise
+    [defaults]                      # optional, values for every [[sensor]] without its own
     kind = "vector"                 # any key of a sensor but id, position and calibration
     noise_nT = 1.0
 

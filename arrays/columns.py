@@ -217,7 +217,7 @@ class LogColumns:
             raise ValueError("Input track must not come together with position or geodetic.")
         if not self.is_placed and (self.attitude or self.course or self.pose_latency_s):
             raise ValueError(
-                "Inputs position or geodetic must come with an attitude or a latency; instead received none."
+                "Input position or geodetic is needed by an attitude and by a latency; instead received neither."
             )
         if self.origin is not None and not self.is_geodetic:
             raise ValueError("Input origin must come with geodetic or crs; instead received neither.")

@@ -21,7 +21,7 @@ from arrays.typing import BoolArray, FloatArray
 
 _EQUAL_NOISE_RTOL = 1e-12
 _LOST = 1e-13
-"""A deviation less than this part of the largest is what rounding made."""
+"""A deviation below this share of the largest one is a rounding error."""
 
 
 def contrasts(n_sensors: int, base: int = -1) -> FloatArray:
@@ -50,7 +50,7 @@ def helmert_decorrelation(n_differences: int) -> FloatArray:
 def eigen_decorrelation(root: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Orthonormal T and variances, largest first, with ``T R Tᵀ = diag(variance)``, for ``R = root rootᵀ`` (n, m).
 
-    R itself, rounded, may have lost its smallest variances: those of sensors 1e8 times as good as others.
+    The rounded R may have lost its smallest variances, of sensors that are 1e8 times as good as others.
     """
     vectors, deviations, _ = np.linalg.svd(root, full_matrices=False)
     if not deviations[-1] > _LOST * deviations[0]:
@@ -96,7 +96,7 @@ def decorrelated_differences(
     ``available`` (C,): channels that have a reading; all by default. ``base``: base sensor among the complete
     sensors of a kind. It changes the differences, never their likelihood. ``covariance_T2`` (C, C): covariance of
     the channels' noise in place of the array's own [T²], as one of :func:`reading_covariance`: block-diagonal by
-    sensor. What it holds of channels without a reading does not count. Returns: with k = channels - rank of the
+    sensor. Entries of channels without a reading are ignored. Returns: with k = channels - rank of the
     common field; k = channels under a prior.
     """
     mask, covariance = _channels(array, available, covariance_T2)

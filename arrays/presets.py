@@ -1,7 +1,7 @@
 """Commercial magnetometers, with the figures of their data sheets.
 
-Only figures that were checked against the document that is named stand here; what could not be checked is left out, and
-has to be given by whoever makes an array of such a sensor. They stand in ``presets.toml``.
+``presets.toml`` has only figures that were checked against the named document. For all others, the user of such a
+sensor states the figure.
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class Detector(Protocol):
 
 
 def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
-    r"""Return the energy of k whitened differences that noise exceeds at a rate.
+    r"""Return the energy that k whitened differences of noise alone exceed with a given rate.
 
     It is a quantile of :math:`\|z'\|^2 \sim \chi^2_k`.
     """

@@ -21,8 +21,8 @@ def stream(seed: int, feature: str, owner: str = "") -> np.random.Generator:
     """Return random numbers of one feature of one sensor, source or carrier.
 
     ``seed``: of the simulation. ``feature``: what they are for, such as ``"noise"``. ``owner``: whose they are, such as
-    a sensor's id. Returns: independent of that of any other name: leaving out a feature or a sensor changes no other
-    one.
+    a sensor's id. Returns: a generator that does not depend on other names, so that the removal of a feature or a
+    sensor changes no other.
     """
     key = (zlib.crc32(feature.encode()), zlib.crc32(owner.encode()))
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

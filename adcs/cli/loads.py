@@ -109,7 +109,7 @@ def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
     noise = ", ".join(f"{name} {1e9 * one:.3g}" for name, one in zip(own.array.ids, own.noise_T, strict=True))
     lag = f"{own.lag.rows:g} rows, {own.lag.seconds:.3g} s" if own.lag.is_known else "not told by these switches"
     text = [
-        f"noise that is left [nT]: {noise}; χ² / numbers (1 is as stated): {own.chi2_per_dof:.3g}",
+        f"noise of the residuals [nT]: {noise}; χ² / numbers (1 if noise is as stated): {own.chi2_per_dof:.3g}",
         f"readings later than states by: {lag}",
     ]
     for name, vectors, sigma, switches in zip(own.names, own.vectors_T, own.sigma_T, own.switches, strict=True):

@@ -46,8 +46,8 @@ class HeadingModel:
         Standard deviation per axis of the difference of the room's field between places an arm's length apart, and the
         time for which a hand stays near one place.
     local_T, local_s : float
-        The same over short distances, and the time in which a hand covers them. It includes the horizontal field that
-        an error of the tilt makes of the vertical one; the vertical component is half as large.
+        The same over short distances, and the time in which a hand covers them. It includes the horizontal
+        field due to errors of the tilt; the vertical component is half as large.
     gyro_drift_rad_s, gyro_drift_s : float
         Standard deviation of the gyro's bias in motion against that at rest, and its time constant.
     gyro_scale : float
@@ -233,7 +233,7 @@ def _excess_variance(
     *,
     offline: bool,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return by what the square of the heading's change in a minute exceeds its variance, and whether by far, (n,).
+    """Return the excess (n,) of the squared change of heading in a minute over its variance, and whether it is large.
 
     A magnet that the filter does not notice turns the heading slowly. The filter's own covariance does not show it.
     """

@@ -39,7 +39,7 @@ def earth_velocity_m_s(utc: Instants) -> FloatArray:
 
 
 def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLike) -> FloatArray:
-    r"""Return the visible part of the Sun's disc behind the Earth, a sphere of the equatorial radius without air.
+    r"""Return the share of the Sun's disc that the Earth, a sphere without an atmosphere, does not hide.
 
     On the sky both are circles with the angular radii a (Sun) and b (Earth) and the distance c. The hidden part is the
     area that they share, over :math:`\pi a^2`.

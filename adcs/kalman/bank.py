@@ -168,7 +168,7 @@ def estimate(
             reasons.append(error)
     if not tracks:
         raise reasons[0]
-    failed = f"; {len(reasons)} of the {len(pieces)} pieces tell no attitude: {reasons[0]}" if reasons else ""
+    failed = f"; {len(reasons)} of the {len(pieces)} pieces determine no attitude: {reasons[0]}" if reasons else ""
     gaps = f"{len(pieces) - 1} gaps longer than {chosen.longest_gap_s:g} s: the filter starts anew after each{failed}"
     return join_tracks(tracks, gaps)
 
@@ -188,7 +188,7 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
     record = part(record, np.array([0]), slice(first, None))
     tracks = estimate_tracks(record, chosen, any_start)
     if not (np.isfinite(tracks.q).all() and tracks.definite.all()):
-        raise ValueError("Input telemetry must have readings that an attitude explains; instead the filter has failed.")
+        raise ValueError("Input telemetry must have readings that an attitude explains; instead the filter found none.")
     track = _track(telemetry, first, record, chosen, tracks)
     return replace(track, warnings=(*warnings, *track.warnings))
 

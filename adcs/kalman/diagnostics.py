@@ -37,7 +37,7 @@ PERIODS_S = (100.0, 300.0, 1000.0)
 
 
 class AttitudeProblem(NamedTuple):
-    """Sentence about what is degraded or not observable, and the instants (n,) concerned."""
+    """Sentence about a degraded or unobservable quantity, and the instants (n,) concerned."""
 
     text: str
     rows: BoolArray
@@ -266,8 +266,7 @@ def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Map
     """Return the largest unobservable torque amplitude [N·m] by period [s].
 
     A torque of amplitude J·d and period T changes the attitude by d (T/2π)² and the rate by d T/2π. No filter can
-    estimate a smaller torque, nor its error, than that of 0.7 standard deviations of the readings of one instant about
-    the worst axis.
+    estimate a torque whose effect is below 0.7 standard deviations of one instant's readings about the worst axis.
     """
     sigma, used = deviations(record, estimates.settings), estimates.settings.sensors
     q, around = estimates.q[run], record.environment

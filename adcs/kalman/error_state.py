@@ -360,7 +360,7 @@ def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: fl
 
 
 def concatenate_starts(starts: Sequence[FilterStart]) -> FilterStart:
-    """Join starts, which have the same optional states, into one of all their runs."""
+    """Join starts with the same optional states into one start of all their runs."""
     q, w, covariance = (np.concatenate([getattr(one, of) for one in starts]) for of in ("q", "w", "covariance"))
     names = starts[0].optional
     return FilterStart(

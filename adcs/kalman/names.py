@@ -23,5 +23,5 @@ MEASURED_BY = {
 
 
 def is_measured(state: str, sensors: str) -> bool:
-    """Return whether sensors, joined by plus signs, include the one that a state needs, if any."""
+    """Return whether sensors, joined by plus signs, include the sensor that a state needs."""
     return state not in MEASURED_BY or MEASURED_BY[state] in sensors.split("+")

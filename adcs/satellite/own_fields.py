@@ -225,7 +225,7 @@ def find_own_fields(
     Parameters
     ----------
     array : SensorArray
-        Vector magnetometers in body axes; one alone gives its fields, three tell where the loads are.
+        Vector magnetometers in body axes; one gives the fields of the loads, three also locate them.
     readings_T : array_like, shape (n, C)
         Readings of the array's channels; NaN where missing.
     time_s : array_like, shape (n,)
@@ -260,7 +260,7 @@ def find_own_fields(
     times = np.asarray(time_s, dtype=np.float64)
     n = len(times)
     if times.ndim != 1 or n < 2 or not (np.diff(times) > 0.0).all():
-        raise ValueError("Input time_s must ascend, two instants or more; instead received others.")
+        raise ValueError("Input time_s must ascend and have at least two instants; instead it does not.")
     readings, gyro = np.asarray(readings_T, dtype=np.float64), np.asarray(gyro_rad_s, dtype=np.float64)
     if array.channel_is_scalar.any():
         raise ValueError("Input array must have vector magnetometers only; instead received a scalar one.")
@@ -278,7 +278,7 @@ def find_own_fields(
     for name, deviation in zip(names, deviations, strict=True):
         if deviation.max() > _UNKNOWN * _PRIOR_T:
             raise ValueError(
-                "Input states must have every load switch, and not always with another; instead received "
+                "Input states must have switches of each load apart from those of others; instead received "
                 f"{name}, whose field the readings do not determine."
             )
     switches = np.sum(np.diff(s, axis=0) != 0.0, axis=0)

@@ -19,7 +19,7 @@ def steps_s(time_s: FloatArray) -> FloatArray:
     """Return the steps (n,) that end at n ascending times; the first is the median."""
     steps = np.diff(time_s)
     if time_s.ndim != 1 or len(time_s) < 2 or not (np.isfinite(steps) & (steps > 0.0)).all():
-        raise ValueError("Input time_s must ascend, two instants or more; instead received others.")
+        raise ValueError("Input time_s must ascend and have at least two instants; instead it does not.")
     return np.concatenate([[np.median(steps)], steps])
 
 

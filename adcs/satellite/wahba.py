@@ -91,7 +91,7 @@ def attitude_of_vectors(
         raise ValueError(f"Input method must be one of {', '.join(VECTOR_METHODS)}; instead received {method!r}.")
     if not len(body_vectors) == len(frame_vectors) == len(sigma_rad) >= 2:
         raise ValueError(
-            "Input body_vectors, frame_vectors and sigma_rad must be as many, two or more; instead received "
+            "Input body_vectors, frame_vectors and sigma_rad must have one length of two or more; instead received "
             f"{len(body_vectors)}, {len(frame_vectors)} and {len(sigma_rad)}."
         )
     body, frame = (np.stack([_units(v) for v in vectors]) for vectors in (body_vectors, frame_vectors))

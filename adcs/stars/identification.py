@@ -139,7 +139,7 @@ class StarMatcher:
 
     @staticmethod
     def _seen(near: SkyCap, camera: StarCamera) -> SkyCap:
-        """Return the part of the sky that images with their centre in the cap show."""
+        """Return the part of the sky in images whose centre lies in the cap."""
         return near.widened(_WIDER * 0.5 * camera.diagonal_rad)
 
     def gate_rad(self, camera: StarCamera) -> float:

@@ -5,7 +5,7 @@ addition:
 
 - ``title``, and ``source``, the public document or sample that shows the format; ``secondary = true`` if that is not
   the maker's own.
-- ``add``, what the user has to add.
+- ``add``, the keys that the user has to add.
 - ``[[layout]]``, tables with keys that replace those of the file. The first layout that the log fits is used: the
   header has its columns, with ``every_sensor = true`` those of all sensors, and a line matches the pattern ``row``.
 

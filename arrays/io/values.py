@@ -1,4 +1,4 @@
-"""Numbers, times and random arguments of callers: masked arrays, dates, durations, generators."""
+"""Arguments of callers: numbers and masked arrays, dates and durations, random generators."""
 
 from __future__ import annotations
 
@@ -94,9 +94,9 @@ def unix_seconds(place: str, cell: str) -> str:
 
 
 def plain_numbers(text: str, separator: str, decimal: str, columns: int) -> tuple[FloatArray, IntArray] | None:
-    """Return the numbers (n, columns) of a text of nothing but numbers, and their lines (n,) from 0.
+    """Return the numbers (n, columns) of a text that has only numbers, and their lines (n,) from 0.
 
-    None for a text with other or empty cells, or with rows of other lengths; blank lines do not matter.
+    None if a cell is empty or has no number, or if rows differ in length. Blank lines are ignored.
     """
     import numpy as np
 

@@ -40,7 +40,7 @@ def seconds_of_cell(place: str, cell: str, columns: LogColumns) -> str:
 
 @lru_cache(maxsize=16)
 def _seconds_of_minute(minute: str, day_first: bool | None) -> float | None:
-    """Return the seconds of the begin of a minute, cached because many rows share it; None if it is none."""
+    """Return the seconds of the begin of a minute, cached because many rows share it; None if the text is no minute."""
     try:
         return float(_seconds_of_instant("", f"{minute}:00", day_first))
     except InputError:
@@ -117,7 +117,7 @@ def date_of(time_s: float) -> str | None:
 def _spread(time_s: FloatArray) -> FloatArray | None:
     """Return times at equal steps within each second; None unless most rows share whole seconds.
 
-    The first second may have begun before its first row, and the last one goes on: their rows have the usual step.
+    The first and the last second may be incomplete: their rows have the usual step.
     """
     if len(time_s) < 2 or (time_s % 1.0).any() or (np.diff(time_s) < 0.0).any():
         return None

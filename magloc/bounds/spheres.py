@@ -142,9 +142,9 @@ def with_detection_ranges(
 ) -> xr.Dataset:
     """Return spheres of :func:`bound_spheres` with the ranges of detection.
 
-    ``detection_range`` over (elevation, azimuth), for each of :data:`magloc.bounds.maps.CASES`, is the greatest
-    distance from the centroid [m] at which the given moment is found, a half and 95 % of the directions of the moment
-    are, and the worst of them is; 0 where none is beside the array.
+    ``detection_range`` over (elevation, azimuth) is the greatest distance from the centroid [m] at which the source is
+    found, for each of :data:`magloc.bounds.maps.CASES`: the given moment, half and 95 % of the directions of the
+    moment, and the worst direction. It is 0 if the source is not found beside the array.
     """
     directions = sphere_grid(spheres["elevation"].to_numpy(), spheres["azimuth"].to_numpy())
     once = directions[:, :-1]  # the last azimuth is the first one again

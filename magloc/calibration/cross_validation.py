@@ -1,4 +1,4 @@
-"""Cross-validation of a calibration on a known path: rows left out are located with what the others give.
+"""Cross-validation of a calibration on a known path: rows left out are located with the calibration of the others.
 
 Blocks of successive rows are left out, because neighbouring rows are nearly one pose.
 """

@@ -266,7 +266,7 @@ def _geometry(problem: CalibrationProblem, state: CalibrationState) -> tuple[Flo
 
 
 def row_priors(problem: CalibrationProblem, state: CalibrationState) -> tuple[FloatArray, FloatArray]:
-    """Return 1/σ of the prior of every unknown of the rows, 0 without one, and its deviation from it, (T, n) each."""
+    """Return 1/σ (T, n) of the prior of the rows' unknowns, 0 without a prior, and their deviations (T, n) from it."""
     weight, deviation = np.zeros((2, len(state.position_m), problem.n_row_unknowns))
     sigma_T = problem.array.common_field_T
     weight[:, -3:] = 0.0 if sigma_T is None else 1.0 / max(sigma_T, 1e-15)

@@ -243,7 +243,9 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
 
 
 def _array_of(path: Path) -> SensorArray:
-    array = array_of_several(path, "which knows no place: magloc locate --position tells the moment at a known one")
+    array = array_of_several(
+        path, "which cannot locate a source: magloc locate --position gives its moment at a known place"
+    )
     # Figures show the name of an array.
     return array if array.name else replace(array, name=path.stem)
 

@@ -291,7 +291,7 @@ def _one_line_warnings(program: str) -> Iterator[None]:
 
 
 class _Notes(logging.Handler):
-    """Prints what the library and the commands log as notes of a program."""
+    """Handler that prints log messages of the library and the commands as notes of a program."""
 
     def __init__(self, program: str) -> None:
         super().__init__()

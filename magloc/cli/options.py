@@ -276,7 +276,7 @@ class KnownOptions:
         """Return the array with an origin of its places on the Earth, and options that know place and date.
 
         The origin is that of the array file or of --place, or else the first place of the log, which a note names. The
-        date of the log or of the array file serves where the ambient field is known from nothing else.
+        date of the log or of the array file is used if nothing else gives the ambient field.
         """
         columns = array.columns
         if columns is None or not (columns.is_geodetic or self.place is not None):

@@ -128,7 +128,7 @@ def platform_moduli(
     currents: FloatArray,
     own_time_s: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what a platform adds to the modulus of the ambient field (n,), and its derivatives (n, q).
+    """Return the effect (n,) of a platform on the modulus of the ambient field, and its derivatives (n, q).
 
     Coefficients are in units of their priors. With times the ambient field is what the coefficients leave of the
     reading of the same sensor, and changes with them.
@@ -170,7 +170,7 @@ def attitude_effects(
     rate_T_s: FloatArray,
     currents: FloatArray,
 ) -> FloatArray:
-    """Return what errors of the attitude (n, m), of unit variance, change of a platform's effect on the modulus."""
+    """Return changes (n, m) of a platform's effect on the modulus by attitude errors of unit variance."""
     if attitude.errors is None:
         return np.zeros((len(time_s), 0))
     errors = attitude.errors.columns(field_T, rate_T_s, currents)

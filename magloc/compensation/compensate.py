@@ -62,7 +62,7 @@ def compensate(
     Raises
     ------
     ValueError
-        The readings are too few, not in order of time, or tell no attitude.
+        The readings are too few, not in order of time, or do not determine the attitude.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def compensate(
 
 
 def _fit_all(log: PlatformLog, terms: Mapping[str, PlatformTerms]) -> dict[str, PlatformFit]:
-    """Return the fits of all sensors, in their order; vector sensors first, because one of them tells the attitude."""
+    """Return the fits of all sensors, in their order; vector sensors first, because one of them gives the attitude."""
     fits = {}
     for sensor in log.array.sensors:
         if sensor.kind == "vector" and log.signals[sensor.id].stretches:
@@ -107,7 +107,7 @@ def _fit_all(log: PlatformLog, terms: Mapping[str, PlatformTerms]) -> dict[str, 
 
 
 def _attitude(log: PlatformLog, fits: Mapping[str, PlatformFit]) -> Attitude:
-    """Return the attitude for scalar sensors, without the platform's field at the vector sensor that tells it."""
+    """Return the attitude for scalar sensors, without the platform's field at the vector sensor that gives it."""
     compass = log.compass
     if compass is None:
         return log.attitude_of_pose()

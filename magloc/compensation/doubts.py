@@ -60,7 +60,7 @@ def _axes_doubts(log: PlatformLog) -> Iterator[str]:
     if turned > _TURNED_DEG:
         yield (
             f"axes: the field of sensor {compass.id} turns by {turned:.2g}° in the world of the pose, expected less"
-            f" than {_TURNED_DEG:g}°: are the axes of the sensor or of the pose others?"
+            f" than {_TURNED_DEG:g}°: are the axes of the sensor or of the pose wrong?"
         )
 
 
@@ -69,7 +69,7 @@ def fit_doubts(of: SensorCompensation, log: PlatformLog) -> Iterator[str]:
     fit = of.fit
     if abs(fit.lag_s) > max(_LATE_SIGMAS * fit.lag_sigma_s, _LATE_S):
         yield (
-            f"lag: the attitude is {fit.lag_s:.3g} ± {fit.lag_sigma_s:.2g} s late beside the readings of {of.sensor};"
+            f"lag: the attitude is {fit.lag_s:.3g} ± {fit.lag_sigma_s:.2g} s later than the readings of {of.sensor};"
             " it is corrected"
         )
     if (changed := _change(fit)) is not None:
@@ -124,7 +124,7 @@ def mismatch_doubts(sensor: str, log: PlatformLog, corrected_T: FloatArray) -> I
     if abs(slope - 1.0) > _SLOPE_WITHIN + _SLOPE_SIGMAS * sigma:
         yield (
             f"mismatch: fast changes of {sensor} in the log are {slope:.2g} ± {sigma:.1g} times those of its"
-            " correction, expected 1: is the calibration of another platform, or are the axes others?"
+            " correction, expected 1: is the calibration of another platform, or do the axes differ?"
         )
 
 

@@ -45,8 +45,8 @@ class Manoeuvres:
     def of(cls, time_s: FloatArray, unit: FloatArray, turning: FloatArray | None = None) -> Manoeuvres:
         """Return the manoeuvres of directions (n, 3) of the ambient field in the array's frame.
 
-        Rates (n, 3) of the array about its axes tell roll from yaw on headings along the field, where the direction
-        alone does not.
+        Rates (n, 3) of the array about its axes distinguish roll from yaw on headings along the field, where the
+        direction alone does not.
         """
         fast = band_passed(time_s, unit, BAND_S)
         slow = unit - fast

@@ -22,7 +22,7 @@ from magloc.readings import Readings, log_format, readings_of_table
 
 @dataclass(frozen=True, eq=False)
 class LogFile:
-    """Text of a log, and what it says.
+    """Text of a log, and its parsed contents.
 
     Attributes
     ----------

@@ -264,7 +264,7 @@ class LinearProblem:
         return cls(rows, samples, columns, field, effect, errors.shape[1], unknowns)
 
     def effect_at(self, unknowns: FloatArray) -> FloatArray:
-        """Return the effect [T] of the platform at some unknowns, in first order; a gradient is none."""
+        """Return the effect [T] of the platform at some unknowns, in first order, without that of a gradient."""
         change = unknowns - self.unknowns
         if self.rows.place_m is not None:
             change[len(change) - 3 - (not self.rows.is_own) :][:3] = 0.0
@@ -311,7 +311,7 @@ def _nuisances(
 
 
 def _coarse_lag(rows: CalibrationRows, terms: PlatformTerms, background: Background) -> float:
-    """Return the lag whose linear fit is the best, without those that are no better than none."""
+    """Return the lag with the best linear fit; 0 if no lag fits clearly better."""
     steps = round(_LARGEST_LAG_S / _LAG_STEP_S)
     lags = _LAG_STEP_S * np.array(sorted(range(-steps, steps + 1), key=abs))
     start, costs = np.zeros(len(terms.names)), []

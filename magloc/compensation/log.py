@@ -97,7 +97,7 @@ class PlatformLog:
 
     @property
     def compass(self) -> Sensor | None:
-        """Vector sensor with the least noise of those that read most of the time, which tells the attitude."""
+        """Vector sensor that gives the attitude: the one with the least noise of those that read in most rows."""
         read = np.isfinite(self.readings.values_T).mean(axis=0)
         usable = [
             sensor

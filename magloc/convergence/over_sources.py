@@ -138,15 +138,13 @@ _VARIABLES = {
         },
     ),
     "iterations": Variable(np.int32, {"long_name": "linearisations that led to the best solution", "units": "1"}),
-    "chi2": Variable(
-        np.float64, {"long_name": "chi-square of the best solution and of what is known of it", "units": "1"}
-    ),
+    "chi2": Variable(np.float64, {"long_name": "chi-square of the best solution and of its priors", "units": "1"}),
     "chi2_from_truth": Variable(
         np.float64, {"long_name": "chi-square of the optimum searched from the truth, if it converged", "units": "1"}
     ),
     "distance": Variable(np.float64, {"long_name": "distance of the best solution from the truth", "units": "m"}),
     "nees": Variable(
-        np.float64, {"long_name": "squared error of the best solution in its covariance, per dimension", "units": "1"}
+        np.float64, {"long_name": "squared error of the best solution over its covariance, per dimension", "units": "1"}
     ),
     "solutions": Variable(np.int32, {"long_name": "distinct solutions within 20 of the best chi-square", "units": "1"}),
     "truth_listed": Variable(

@@ -6,7 +6,7 @@ kind, one that takes no step uphill and one that needs no start, and a map of ho
 * :class:`RepeatedFilter`: the same readings are processed again and again by an extended Kalman filter whose covariance
   grows by :math:`S_q S_q^T` before every pass. It forgets its start, so where it stops is a maximum of the likelihood.
 * :class:`IekfFilter`: the iterated extended Kalman filter with the start as the mean of a prior.
-* :class:`DampedFilter`: the same cost as the latter's, by Levenberg-Marquardt steps.
+* :class:`DampedFilter`: the cost of that filter, by Levenberg-Marquardt steps.
 * :class:`GlobalFilter`: the start-free search.
 
 Source: Pavlov, Karshakov, Goldin, "Determination of the magnetic field parameters of an object from remote

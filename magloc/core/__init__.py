@@ -51,7 +51,7 @@ class Problem:
 
 @lru_cache  # readings that come one by one describe the same kinds of problems again and again
 def _type_and_fields(kind: str) -> tuple[Any, dict[str, tuple[Any, np.dtype[Any] | None]]]:
-    """Return a pointer's type, and of every field that points to numbers the C type and that of its elements."""
+    """Return the type of a pointer to a struct, and the C types of its array fields and of their elements."""
     types: dict[str, tuple[Any, np.dtype[Any] | None]] = {}
     for name, field in ffi.typeof(f"magloc_{kind}").fields:
         element = field.type.item.cname if field.type.kind == "pointer" else ""

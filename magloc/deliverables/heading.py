@@ -42,8 +42,8 @@ class _Line(NamedTuple):
 def heading_error(xy_m: FloatArray, values_T: FloatArray, lines: Sequence[FlightLine]) -> HeadingError | None:
     """Return the part of values (n,) that is a sine of the course of lines; None if they do not determine it.
 
-    Each line is compared with two lines before and two after it, row by row: their fourth difference holds little of
-    the field of the ground and of slow changes of the ambient field. The median of a line counts.
+    Each line is compared with two lines before and two after it, row by row: their fourth difference contains
+    little of the field of the ground and of slow changes of the ambient field. The median of a line counts.
     """
     straight = list(filter(None, (_straight_line(xy_m[line.rows], values_T[line.rows]) for line in lines)))
     n = len(straight) - len(_WEIGHTS) + 1

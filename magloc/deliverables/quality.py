@@ -380,7 +380,7 @@ def _spread(values: FloatArray) -> float:
 
 
 def _without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
-    """Return moduli less that of the ambient field, where it is known for every row."""
+    """Return the moduli minus the modulus of the ambient field if that is known for every row."""
     if rows.ambient_T is None:
         return moduli_T
     return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])

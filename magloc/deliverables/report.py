@@ -39,7 +39,7 @@ _PROFILES = (
     " the ground."
 )
 _FLAGS = {
-    "weak": "the depth interval holds, the ellipse does not",
+    "weak": "trust the depth interval, not the ellipse",
     "near": "another target is so near that one of the two may be spurious",
     "merged": "more than one source, too near to each other to be separated",
     "edge": "at the edge of the volume that was searched",

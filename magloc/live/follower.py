@@ -55,7 +55,7 @@ class LivePoint(TrackPoint):
     nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1, correction, dropped_sensors, mixture
         See :class:`TrackPoint`.
     row : Row
-        Readings and pose of the row, less the background of a rest.
+        Readings and pose of the row, minus the background of a rest.
     latency_s : float
         Time from the arrival of the row to this point [s].
     tally : Tally

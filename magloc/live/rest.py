@@ -36,7 +36,7 @@ class RestBackground:
     Attributes
     ----------
     mean_T : ndarray, shape (C,)
-        Raw readings less the offsets of the calibration; NaN for a channel without readings.
+        Raw readings minus the offsets of the calibration; NaN for a channel without readings.
     sigma_T : ndarray, shape (C,)
         Standard deviation of the error of the mean.
     n_rows : int
@@ -94,7 +94,7 @@ class RestBackground:
         return cls(mean - array.channel_offset_T, sigma, len(rows), unsteady)
 
     def subtract_from(self, row: Row) -> Row:
-        """Return a row less the background."""
+        """Return a row minus the background."""
         return replace(row, readings_T=row.readings_T - self.mean_T)
 
     def with_offset_uncertainty(self, array: SensorArray) -> SensorArray:
@@ -127,7 +127,7 @@ def subtract_rest(array: SensorArray, readings: Readings, rest_s: float) -> tupl
     array : SensorArray
         The array with the offset uncertainties that remain.
     readings : Readings
-        All rows less the mean.
+        All rows minus the mean.
 
     Raises
     ------

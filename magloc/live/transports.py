@@ -64,7 +64,7 @@ def sender_waits(address: str) -> bool:
 def open_stream(address: str, *, replay_speed: float = 1.0, form: LogFormat = READINGS_FILE) -> Iterator[Stream]:
     """Open the stream of an address; raise InputError if that is not possible.
 
-    ``form`` tells the times of the rows of a file.
+    ``form`` describes the times in the rows of a file.
     """
     if address == STANDARD_INPUT:
         yield Stream("standard input", _split_lines(_read_stdin()))

@@ -80,9 +80,8 @@ class SensorErrors:
     walk : ndarray, shape (n,)
         Standard deviation of a random walk per root of a second.
     of_sensor : ndarray, shape (a, 2)
-        Sensor and kind of error of the first a states. Kinds are rotations about the sensor's three axes, their gains,
-        components of a field that is fixed to the array, and 3×3 components each of the fields that the ambient field
-        and its rate induce.
+        Sensor and kind of error of the first a states. Kinds are rotations about the sensor's three axes, gains of
+        the axes, a field fixed to the array, and 3×3 components each of induced fields and of eddy currents.
     of_channel : ndarray, shape (n - a,)
         Channel of the other states, which are drift and 1/f noise.
     is_slope : ndarray of bool, shape (n - a,)

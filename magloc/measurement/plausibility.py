@@ -270,7 +270,7 @@ def _ambient_doubts(array: SensorArray, used: Readings) -> Iterator[str]:
         f"the sensors read {abs(1e9 * off_T):.0f} nT {'more' if off_T > 0.0 else 'less'} than the ambient field of"
         f" {1e9 * modulus_T:.0f} nT, in most rows, far beyond an uncertainty of {1e9 * sigma_T:.3g} nT"
         f" ({stated_or_not}): check the place, the date and the units that the field is from, and whether iron or"
-        " geology is near; a larger ambient_uncertainty_nT of the array has the field estimated"
+        " geology is near; with a larger ambient_uncertainty_nT of the array, the field is estimated"
     )
 
 
@@ -351,7 +351,7 @@ def _attitude_doubts(array: SensorArray, readings: Readings, rotation: Rotation)
         return
     yield (
         f"the ambient field, of steady modulus, turns in the world by {np.degrees(stated):.0f}° in the median as the"
-        f" array turns{explained}: is the attitude that from the array's frame to the world's{question}"
+        f" array turns{explained}: does the attitude rotate the array's frame to the world's{question}"
     )
 
 

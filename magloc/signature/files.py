@@ -21,7 +21,7 @@ _POINTS = 61
 
 
 def lines_of_signature(signature: Signature) -> list[str]:
-    """Return the parameters with σ, what is not determined, and the goodness of fit."""
+    """Return the parameters with σ, undetermined combinations, and the goodness of fit."""
     determined = signature.determined
     cells = [["part", "A·m²", "σ", ""]]
     for name, value, sigma in zip(signature.names, determined, signature.sigma_Am2, strict=True):

@@ -393,7 +393,7 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: 
                 step.iterations,
                 nis=step.nis,
                 nis_dof=model.rows[i].z.size,
-                status=step.status if known else "not determined: the readings so far do not tell the whole moment",
+                status=step.status if known else "not determined: the readings do not yet determine the whole moment",
                 centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
                 radius_m=array.circumradius or 1.0,  # a unit of ranges; a single sensor has no circumradius
             )

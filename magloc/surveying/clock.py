@@ -173,7 +173,7 @@ class SmoothTrack:
         return None if ambient is None or turn is None else np.asarray(turn.apply(ambient))
 
     def with_earlier_poses(self, lag_s: float, rows: IntArray | None = None) -> Readings:
-        """Return readings with the poses of an earlier time, and the ambient field to match.
+        """Return readings with the poses of an earlier time, and the ambient field in these poses.
 
         Each pose changes by as much as the smooth track does in that time. Interpolation between two rows would average
         their errors and seem likelier for that reason alone. The modulus of the ambient field stays that of the row's

@@ -110,7 +110,7 @@ def search(record: SurveyRecord, background: SurveyBackground, sources: Sources,
     Q = with_free_sources(record, background, sources)
     residual = residual_of(record, background, fields)
     left = residual - Q @ (Q.T @ residual)
-    Q = Q.astype(np.float32)  # rounding does not matter for what is projected out
+    Q = Q.astype(np.float32)  # rounding does not matter for projected-out columns
 
     def explain(tile: tuple[float, FloatArray]) -> Candidates:
         distance, places = tile

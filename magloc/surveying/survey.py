@@ -142,8 +142,8 @@ def survey(
         tiled, lag = tiled.settle(strongest_sources, each, tell)[0].correct_lag(assumed)
         if lag.s:
             _LOG.warning(
-                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
-                " into account"
+                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show;"
+                " this is corrected"
             )
             tiled, _ = tiled.settle(strongest_sources, each, tell)
         tiled, due = tiled.settle(significant_sources, each, tell)

@@ -262,7 +262,7 @@ def read_altitudes(path: str | PathLike[str], array: SensorArray, column: str, t
 
 
 def terrain_below(parts: Sequence[Readings], altitudes_m: Sequence[FloatArray], name: str) -> Terrain:
-    """Return the ground below readings: heights of the array less those of an altimeter.
+    """Return the ground below readings: the height of the array minus that of the altimeter.
 
     The ground is the median in cells of half a metre, and linear between them.
     """

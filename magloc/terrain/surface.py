@@ -122,7 +122,7 @@ class Terrain:
         return np.stack(rises, axis=-1) / (2.0 * self.cell_m)
 
     def flatten(self, place_m: FloatArray) -> FloatArray:
-        """Return places (..., 3) with heights less the relief: there the ground is the plane at ``height_m``."""
+        """Return places (..., 3) with heights minus the relief: there the ground is the plane at ``height_m``."""
         return self._shift(place_m, -1.0)
 
     def drape(self, place_m: FloatArray) -> FloatArray:
@@ -167,7 +167,7 @@ FLAT = Terrain()
 
 
 def interpolate_points(place_m: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return the height at places (n, 2) as a function of them, NaN outside points (m, 3).
+    """Return a function of places (n, 2) that gives the height, NaN outside points (m, 3).
 
     It is a cubic spline if the points form a grid along the axes, otherwise linear between neighbours.
     """
@@ -188,7 +188,7 @@ def interpolate_points(place_m: FloatArray) -> Callable[[FloatArray], FloatArray
 
 
 def interpolate_nodes(values: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return the value at indices (2, n) as a function of them: a cubic spline, NaN beside nodes without a value."""
+    """Return a function of indices (2, n): a cubic spline through the nodes, NaN beside nodes without a value."""
     unknown = np.isnan(values).astype(np.float64)
     spline = _spline_coefficients(_fill(values))
 

@@ -274,14 +274,14 @@ class InnovationTest:
             return ""
         if self.is_disjoint:
             return (
-                f"a track begins in {self.starts} rows and goes on in {self.rows}, no row tells of the next: by the"
-                " times, the speed and the rate of turn the source may be anywhere after a step (are times in seconds?)"
+                f"a track begins in {self.starts} rows and goes on in {self.rows}, no row predicts the next: with"
+                " these times, speed and rate of turn the source may be anywhere after a step (are times in seconds?)"
             )
         if self.z_constants > THRESHOLD:
-            z, what = self.z_constants, "the rows agree on another mounting or lever arm than the exact one"
+            z, what = self.z_constants, "the rows fit another mounting or lever arm than the stated one"
             why = "position_constant_m and attitude_constant_deg of the pose are stated too small"
         elif self.z_ambient > THRESHOLD:
-            z, what = self.z_ambient, "the rows agree on another ambient field than the exact one"
+            z, what = self.z_ambient, "the rows fit another ambient field than the stated one"
             why = "ambient_uncertainty_nT is stated too small"
         elif self.z_lag1 > THRESHOLD and not self.excess < 0.0:
             z, what = self.z_lag1, "differences between readings and predictions are alike in successive rows"

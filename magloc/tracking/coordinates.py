@@ -78,7 +78,8 @@ class Chart:
     def with_firm_moments(self, S: FloatArray) -> Chart:
         r"""Return the chart with strength and direction as coordinates of well-known moments.
 
-        These are the moments whose σ by the roots S (..., n, m) is small. With :math:`n = \delta\mu/|\mu|`,
+        A moment is well known if its σ is small; S (..., n, m) are roots of the covariances. With
+        :math:`n = \delta\mu/|\mu|`,
 
         .. math:: m' = (r'/r)^4 |m| e^{\hat m \cdot n} b/|b|, \qquad b = \hat m + (1 - \hat m \hat m^T) n.
 

@@ -39,7 +39,7 @@ def array_axes_transition(
     array_velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
     array_rate_rad_s: ArrayLike = (0.0, 0.0, 0.0),
 ) -> tuple[FloatArray, FloatArray]:
-    r"""Return a step of position and moment in the axes of a moving array, (17) and (29).
+    r"""Return a step of position and moment in the axes of a moving array.
 
     .. math::
 

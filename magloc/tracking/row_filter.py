@@ -242,7 +242,7 @@ def update(
     row : int
         Index of the row.
     bends : ndarray of bool, shape (C,), optional
-        Predictions whose states of sources and pose are as nonlinear as the readings; nuisances take the rest.
+        Predictions whose states of sources and pose are as nonlinear as the readings; nuisances absorb the remainder.
     pose_lasts : ndarray, shape (n_pose,), optional
         Share of each error of the pose for which this holds; by default 1.
     innovation, linearisations : bool

@@ -1,8 +1,8 @@
 """Truth and readings of many attitude runs at once; the first axis of all arrays is the run.
 
-:func:`simulate` lets the control see the true state. That makes no difference to a filter which is told the torque that
-was set. Where the loop shall be closed by an estimate, :func:`prepare` gives everything that does not depend on it, and
-:func:`sense` and :func:`advance` go on from instant to instant.
+:func:`simulate` lets the control see the true state. A filter that knows the commanded torque is not
+affected. For a loop that is closed by an estimate, :func:`prepare` gives everything that does not depend on it, and
+:func:`sense` and :func:`advance` continue from instant to instant.
 """
 
 from __future__ import annotations

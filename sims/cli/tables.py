@@ -24,9 +24,9 @@ def tables(
 
     Prints the value of the paper, our value and the ratio. Process noise and noise of the star tracker are as printed,
     as far as they are legible. Our value is the standard deviation of the filter at the end, of the worst axis,
-    averaged over the runs; beside it stands the rms of the errors in the last minute. The attitude is half of the
-    angle, as in the paper. A star marks a ratio beyond three; the reason stands below. Runs of Table 3 take 200 s, all
-    others 600 s, unless --duration is given. --out writes tables.csv.
+    averaged over the runs, followed by the rms error of the last minute. The attitude is half of the angle, as in the
+    paper. A star marks a ratio beyond three; the reason is given below. Runs of Table 3 take 200 s, all others 600 s,
+    unless --duration is given. --out writes tables.csv.
 
     Parameters
     ----------

@@ -47,8 +47,8 @@ class Detumbling:
     runs : AttitudeRuns
         Truth, readings, and the moments that were commanded: their mean over each cycle.
     time_s, theory_s : ndarray, shape (runs,)
-        Until the rate stays below 0.5 °/s for a minute, and what the equation of the mean torque says; NaN where not
-        within the run, and without torquers.
+        Time until the rate stays below 0.5 °/s for a minute, and its prediction by the mean torque; NaN if it is not
+        reached within the run, and without torquers.
     """
 
     runs: AttitudeRuns

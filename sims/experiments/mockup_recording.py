@@ -207,6 +207,6 @@ def record_lines(run: RecordRun) -> list[str]:
     return [
         f"{result['samples']} samples, {result['fixes']} fixes after the first, fusion {run.method}",
         f"fixes                              {counts_in_words(result['used_fixes'], result['unused_fixes'])}{left_out}",
-        f"fused less camera, undelayed [mm]  {'none' if apart is None else f'{apart:.2f}'}",
+        f"fused minus camera, undelayed [mm] {'none' if apart is None else f'{apart:.2f}'}",
         f"at the end, {result['time_s']:.2f} s: X {x:.4f} m, Y {y:.4f} m, heading {result['heading_deg']:.2f}°",
     ]

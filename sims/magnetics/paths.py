@@ -29,8 +29,8 @@ _SAME_PLACE_M = 1e-9
 class Motion:
     """Positions and velocities at n instants.
 
-    ``course_rad`` (n,): direction of the horizontal velocity, clockwise from north; the last one where there is none
-    [rad].
+    ``course_rad`` (n,): direction of the horizontal velocity, clockwise from north [rad]; at rest, the last
+    one.
     """
 
     position_m: FloatArray  # (n, 3): in the world frame [m]

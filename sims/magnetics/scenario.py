@@ -202,7 +202,7 @@ class MagneticScenario:
         for sensor, model in zip(self.array.sensors, self.models, strict=True):
             if sensor.kind != model.reads:
                 raise ValueError(
-                    f"Input models must read what the sensors do; instead received a {model.reads} model "
+                    f"Input models must be of the kinds of the sensors; instead received a {model.reads} model "
                     f"for the {sensor.kind} sensor {sensor.id!r}."
                 )
 

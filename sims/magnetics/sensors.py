@@ -2,9 +2,9 @@
 
 The figures are of the order that makers publish for calibrated instruments of a kind, not those of one instrument: a
 fluxgate such as Bartington's Mag-13, an optically pumped total-field sensor such as QuSpin's QTFM, an Overhauser sensor
-such as GEM's GSM-19, a low-temperature SQUID, a magnetoresistive chip such as Memsic's MMC5983MA. A scenario overrides
-whatever it knows better. Misalignment and error of the gain are what remains after a good calibration; that of the gain
-of a scalar sensor stands for its heading error.
+such as GEM's GSM-19, a low-temperature SQUID, a magnetoresistive chip such as Memsic's MMC5983MA. A scenario may
+replace each figure. Misalignment and gain error remain after a good calibration; the gain error of a scalar sensor
+represents its heading error.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class SensorModel:
     def sigma_T(self, rate_Hz: float) -> float:
         """Standard deviation of errors that are independent between samples [T].
 
-        White noise, rounding, and the 1/f noise above the decades that an array states as lasting; that of the rest of
-        the 1/f noise depends on the record.
+        White noise, rounding, and the 1/f noise above the decades that an array file states. The remaining 1/f noise
+        depends on the length of the record.
         """
         white = white_sigma(rate_Hz, self.noise_T_rtHz, self.bandwidth_Hz)
         flicker = flicker_sigma(rate_Hz, self.noise_T_rtHz, self.corner_Hz, self.bandwidth_Hz, FASTEST_FLICKER_HZ)

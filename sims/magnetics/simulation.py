@@ -85,11 +85,11 @@ class _Pose:
 def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     """One realisation of a scenario.
 
-    The field at every sensor is that of the ambient field with its pulsations, of the platform and of all sources at
-    that instant. Then come calibration with its errors, the sensor's low-pass, noise and drift, rounding, and
-    saturation: a reading beyond the range is the range.
-    ``seed``: the same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream:
-    leaving out one changes no other.
+    The field at every sensor is the sum of the ambient field with its pulsations, the platform and all sources at that
+    instant. Then follow calibration with its errors, the sensor's low-pass, noise and drift, rounding, and saturation:
+    a reading beyond the range is replaced by the limit of the range.
+    ``seed``: the same seed gives the same numbers. Every feature of every sensor has its own stream,
+    selected by the id: the removal of one changes no other.
     """
     time_s = scenario.time_s
     array_pose = _pose(scenario.carrier, time_s, seed, "array")

@@ -176,7 +176,7 @@ class TableScenario:
 class TableRun:
     """Truth and readings of a run.
 
-    ``true_start``, ``start``: at 0 s, and what is known of it: as well as from a fix, and the true velocity.
+    ``true_start``, ``start``: state at 0 s, and its estimate with the error of a fix and the true velocity.
     """
 
     truth: PlanarTrack  # at the end of each sample
@@ -291,7 +291,7 @@ def _fixes(flown: PlanarTrack, camera: CameraErrors, seed: int) -> tuple[FixReco
 def perimeter_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
     """Return the true readings of every poll around the table, and the start, at rest.
 
-    ``rng``: for where and which way round it starts, its heading, and how it turns.
+    ``rng``: draws the start, the sense of the circle, the heading and the turns.
     """
     time_s = POLL_S * np.arange(1.0, n_polls + 1.0)
     middle_s = time_s - 0.5 * POLL_S

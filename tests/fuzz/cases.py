@@ -73,6 +73,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "--array array.toml --from - --speed-m-s 0.1",
         "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3 --out out.csv",
         "--array log.toml --from replay:log.csv --replay-speed 1e6",
+        "--array array.toml --from replay:readings.csv --replay-speed 1e6 --calibrate --out-array out.toml",
     ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",

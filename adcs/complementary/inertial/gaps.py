@@ -18,7 +18,7 @@ _STEEP, _LONG = 6, 10.0
 _SHOWN_RAD, _SHOWN_S = 0.15, 0.3  # in a shorter gap the room's field may change as much as by a rotation
 _TINY = 1e-12
 HELD_VARIANCE = 4.0
-"""Variance with the rate at one end of a gap over that with both, for a rate that is a random walk."""
+"""Ratio of variances with the rate at one end of a gap and at both ends, for a random-walk rate."""
 UNKNOWN_RAD = math.pi / math.sqrt(3.0)
 """Standard deviation of an unknown angle."""
 LOST_RAD = 0.05

@@ -94,7 +94,7 @@ class _LaterMeans:
     counts: FloatArray  # (n,): number that are known
 
     def mean_square(self, up: FloatArray, *, offline: bool) -> FloatArray:
-        """Return the mean squared angle (n,) to a direction up (n, 3), of what is known, offline of all."""
+        """Return the mean squared angle (n,) to a direction up (n, 3), of the rows so far; offline, of all rows."""
         square = np.sum((self.unit - up[self.began]) ** 2, axis=1)
         errors = np.cumsum(np.bincount(self.ends, square, len(up))) / np.maximum(self.counts, 1.0)
         return np.full(len(errors), errors[-1]) if offline else errors
@@ -153,7 +153,7 @@ def _smoothed_up(
 
 
 def _gaps(steady: Steady) -> list[tuple[int, int, FloatArray, bool]]:
-    """Return gaps that matter: rows before and after, growing variance, and whether it is the gyro's."""
+    """Return significant gaps: rows before and after, growth of the variance, and True for a gap of the gyro."""
     time_s, found = steady.time_s, []
     for before, after in steady.gaps:
         growth = np.cumsum(steady.hidden_rad2[before + 1 : after + 1])

@@ -202,7 +202,7 @@ class ZeroFit:
         return self.zeros[0]
 
     def zero_course(self, courses: ArrayLike | None = None) -> FloatArray:
-        """Return the zeros of each sample, (n, 2), or (2,) without courses (m, n), those of the problem."""
+        """Return the zeros (n, 2) of each sample for the problem's courses (m, n), or (2,) without courses."""
         if courses is None:
             return self.zeros[0]
         return self.zeros[0] + np.asarray(courses, dtype=np.float64).T @ self.zeros[1:]

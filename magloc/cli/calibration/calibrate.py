@@ -188,8 +188,8 @@ def _validation_notes(validation: CrossValidation, background: str | None) -> li
     ]
     if background is not None:
         notes.append(
-            "the offsets contain the background of the array at rest, and the common field is small beside them; the"
-            " array file written states it, as this locates left-out rows better: calibrate again when the array moves"
+            "the offsets contain the background of the array at rest; left-out rows are located better if the array"
+            " file states a small common field, so it states one: calibrate again when the array moves"
         )
     return notes
 
@@ -354,9 +354,9 @@ def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> l
     common = float(np.median(gains))
     if strangers and np.mean(np.abs(gains - common) < _ALIKE * abs(common)) > 0.5 and abs(common - 1.0) > 2.0 * _ALIKE:
         notes.append(
-            f"warning: the gains of most sensors are about {common:.2g} times those of the array file, as they are"
-            f" where the moments in the truth file or the unit of the readings are wrong by {common:.2g}; sensors that"
-            " are wrong differ from each other"
+            f"warning: the gains of most sensors are about {common:.2g} times those of the array file:"
+            f" the moments in the truth file or the unit of the readings are probably wrong by {common:.2g}, because"
+            " faulty sensors would differ from each other"
         )
     elif strangers:
         notes.append(f"warning: gains far beyond --gain-prior, a dead or wrong sensor: {', '.join(strangers)}")

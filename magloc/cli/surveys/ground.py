@@ -50,8 +50,8 @@ class SurfaceOptions:
     ) -> tuple[float | Terrain, list[Readings], Vector | None]:
         """Return the ground, the readings with heights in the world frame, and the origin of that frame.
 
-        Where heights of the log count from the ground, the readings and an origin without a height get those of the
-        terrain.
+        If heights of the log count from the ground, the terrain gives the heights of the readings, and of an origin
+        without one.
         """
         if self.terrain is None:
             return self.ground_m, parts, origin

@@ -227,7 +227,7 @@ def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None
 
 
 def _note_ground(given: arrays.SensorArray, used: arrays.SensorArray, ground: GroundOptions) -> None:
-    """Name the height that the ground is stated above, where it is that of the log's first place."""
+    """Print a note if the stated height of the ground counts from the first place of the log."""
     is_stated = given.columns == used.columns or used.columns is None or used.columns.above_ground
     if is_stated or ground.terrain is not None:
         return

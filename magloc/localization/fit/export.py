@@ -24,7 +24,7 @@ QUANTITIES = STATE_QUANTITIES | {
     "range_low_m": Quantity("m", "least distance from the sensors' centroid, 95 % set"),
     "range_high_m": Quantity("m", "largest distance from the sensors' centroid, 95 % set; infinite where open"),
     "gaussian": Quantity("1", "whether the covariance describes the uncertainty"),
-    "merged": Quantity("1", "whether the source stands for two"),
+    "merged": Quantity("1", "whether the source represents two that the array cannot separate"),
     "chi2": Quantity("1", "sum of squared residuals of the decorrelated differences"),
     "dof": Quantity("1", "differences minus unknowns"),
     "weight": Quantity("1", "probability that the solution is the right one"),

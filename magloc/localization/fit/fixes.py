@@ -211,7 +211,7 @@ class Fixes(Result, Sequence[Fix]):
 
     @cached_property
     def body_factor(self) -> FloatArray:
-        """Factor (n,) by which rms errors would exceed their standard deviations for objects of `body_covariance`."""
+        """Ratio (n,) of the rms error to the stated σ for an extended object with `body_covariance`."""
         factor, added, columns = np.ones(len(self)), self.body_covariance, self.solutions
         matter = np.flatnonzero(added.any(axis=(1, 2)))
         size = columns.covariance.shape[1] // columns.position_m.shape[1]  # unknowns of one source

@@ -272,7 +272,7 @@ class BeamSearch:
         return JointFits.none((len(q),), q.shape[1]).replace(first, fits).replace(others, more)
 
     def remove_source(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
-        """Return the beam with one source less, each source of the best fit removed in turn."""
+        """Return fits with one source fewer: each source of the best fit is removed in turn."""
         n_sources = beam.n_sources
         q, mu = _fill_missing(beam.rows((slice(None), slice(0, 1))))
         others = np.array([[k for k in range(n_sources) if k != out] for out in range(n_sources)])

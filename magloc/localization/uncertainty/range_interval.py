@@ -28,7 +28,7 @@ _N_BISECTIONS = 24
 
 
 def is_detected(energy: ArrayLike, n_differences: int) -> NDArray[np.bool_]:
-    """Return whether an energy is significant; that of noise alone is in one of a thousand rows."""
+    """Return whether an energy is significant: noise alone exceeds the threshold in one of a thousand rows."""
     return np.asarray(np.asarray(energy) > energy_threshold(n_differences))
 
 

@@ -142,7 +142,7 @@ def _warn_of_biased_mode(tracker: Tracker, measurements: Sequence[RowMeasurement
         )
     pull = abs(log_number[1] - log_number[0]) / (2.0 * _APART) * float(np.median(sigma))
     if pull > 1.0:
-        _LOG.warning("how the source moves tells where it is: errors may be several times their standard deviations")
+        _LOG.warning("the motion alone determines the position: errors may be several times their standard deviations")
 
 
 def _scale_range(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:

@@ -76,7 +76,7 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
 
 
 def _with_constants(array: SensorArray) -> SensorArray:
-    """Return the array with usual errors of what counts as exact, unchanged if nothing does."""
+    """Return the array with usual errors for all that counts as exact; unchanged if there is nothing."""
     pose, usual = array.pose, PoseUncertainty()
     if pose is not None and not pose.position_constant_m and not pose.attitude_constant_rad:
         constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}

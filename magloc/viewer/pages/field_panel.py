@@ -55,7 +55,7 @@ class FieldPanel:
             kinds = (NONE, MEASURED, RESIDUAL) if has_arrows else (NONE,)
             self.arrows_dropdown = gui.add_dropdown(
                 "arrows", kinds, disabled=not has_arrows,
-                hint="Fields at the vector sensors less their mean, or residuals of the fix, on one scale.",
+                hint="Fields at the vector sensors minus their mean, or residuals of the fix, on one scale.",
             )  # fmt: skip
             self._panel = gui.add_html("")
         follow = CoalescedCall(self._show)
@@ -85,7 +85,7 @@ class FieldPanel:
         self._panel.content = texts.panel_html(lines) if lines else ""
 
     def _vectors(self, kind: str) -> FloatArray:
-        """Return the fields (n, 3) at the vector sensors less their mean, in the array's axes [T]."""
+        """Return the fields (n, 3) at the vector sensors minus their mean, in the array's axes [T]."""
         if self._rows is None:
             return np.zeros((0, 3))
         row = self._rows[self._view.row]

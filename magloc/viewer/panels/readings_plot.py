@@ -69,7 +69,7 @@ class ReadingsPlot:
     array : SensorArray
         Array of the readings.
     residuals_T : ndarray, shape (n, C), optional
-        Readings less the predictions of a source; without them residuals cannot be shown.
+        Readings minus the predictions of a source; without them residuals cannot be shown.
     window_s : float, optional
         Length of the time axis before the last row [s]; by default it begins at the first row.
 
@@ -237,7 +237,7 @@ class ReadingsPlot:
 
 
 def residuals_of(array: SensorArray, rows: Readings, positions_m: FloatArray, moments_Am2: FloatArray) -> FloatArray:
-    """Return the readings (n, C) less the predictions of a source [T].
+    """Return the readings (n, C) minus the predictions of a source [T].
 
     ``positions_m``, ``moments_Am2`` (n, 3): source in the world if the rows have poses, otherwise in the array's frame.
     """
@@ -257,7 +257,7 @@ def plot_channels(array: SensorArray) -> list[Channel]:
 
 
 def differences_from_mean(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    """Return the calibrated fields less the mean of all sensors of the same kind (n, C) [T].
+    """Return the calibrated fields minus the mean of all sensors of the same kind (n, C) [T].
 
     ``readings_T`` (n, C): readings [T], NaN where missing. Vector sensors give components along the array's axes; NaN
     where a reading of the sensor is missing.

@@ -321,7 +321,7 @@ class TestBroad:
 class TestInput:
     def test_record(self):
         good, time_s = np.ones((200, 3)), DT * np.arange(200)
-        with pytest.raises(ValueError, match="time_s must ascend, two instants or more"):
+        with pytest.raises(ValueError, match="time_s must ascend and have at least two instants"):
             InertialMagneticRecord(0.0 * time_s, good, good, good)
         with pytest.raises(ValueError, match="time_s must cover a second at least"):
             InertialMagneticRecord(time_s[:50], good[:50], good[:50], good[:50])

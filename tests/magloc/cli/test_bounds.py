@@ -278,7 +278,7 @@ class TestBadInput:
         path = tmp_path / "one.toml"
         write_array(path, SensorArray(tetrahedron(1.0).sensors[:1], common_field_T=1e-9))
         outcome = run("bounds", "--array", path, "--out", tmp_path / "out")
-        assert_refused(outcome, "received 1, which knows no place: magloc locate --position")
+        assert_refused(outcome, "received 1, which cannot locate a source: magloc locate --position")
 
     @with_plain_pictures
     def test_an_interruption_says_what_is_done(self, tmp_path, capsys, monkeypatch):

@@ -35,7 +35,7 @@ class TestReportHtml:
     ) -> None:
         weak = replace(survey, targets=(replace(survey[0], flags=("weak",)), *survey[1:]))
         page = report_html(weak, frame, "Meadow", {}, figures)
-        assert "<b>weak</b>: the depth interval holds" in page
+        assert "<b>weak</b>: trust the depth interval" in page
         assert "<b>merged</b>" not in page
 
     def test_the_ground_is_below_the_origin(
