@@ -103,6 +103,12 @@ def find_sensors(log: Log) -> LogSensors:
     return LogSensors(gyro, accelerometer, tuple(working), _own_attitude(log), tuple(warnings))
 
 
+def magnetometer_names(log: Log) -> list[str]:
+    """Return the first channels of the magnetometers of a log, by the best of the names that an autopilot has."""
+    found = ([name for name in log if re.fullmatch(pattern, name)] for pattern in _MAGNETOMETERS)
+    return next(filter(None, found), [])
+
+
 def _inertial(log: Log, kind: str, patterns: Sequence[str]) -> VectorReadings:
     """Return the first sensor that is fast enough, or the one with the most readings."""
     found = list(_candidates(log, patterns))
@@ -123,7 +129,7 @@ def _candidates(log: Log, patterns: Sequence[str]) -> Iterator[VectorReadings]:
         for name in log:
             if not re.fullmatch(pattern, name) or len(log[name]) < 2:
                 continue
-            names = _axes(name)
+            names = axes_of(name)
             if not set(names) <= set(log):
                 continue
             time_s, values = log.vectors(names)
@@ -135,7 +141,7 @@ def _candidates(log: Log, patterns: Sequence[str]) -> Iterator[VectorReadings]:
             yield VectorReadings(name, time_s, values)
 
 
-def _axes(name: str) -> tuple[str, str, str]:
+def axes_of(name: str) -> tuple[str, str, str]:
     """Return the channels of the three axes by that of the first."""
     if name.endswith("[0]"):
         stem = name.removesuffix("[0]")
