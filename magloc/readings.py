@@ -26,13 +26,14 @@ from arrays.array import AMBIENT_CHANNELS, SensorArray
 from arrays.columns import LINE, POSITION_COLUMNS, ROTATION_COLUMNS
 from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
-from arrays.io.text import read_text, write_text
+from arrays.io.text import write_text
 from arrays.io.values import LARGEST_T, fields, numbers, seconds
 from arrays.logs.format import LogFormat, without_dummies
 from arrays.logs.lines import line_starts
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
+from magloc.logs.readings_table import table_of_file
 from magloc.navigation.course import turned_to_course
 from magloc.navigation.fixes import without_gaps
 from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
@@ -248,7 +249,7 @@ def read_readings(
     Parameters
     ----------
     path : str or path-like
-        A readings file (CSV): fields in nT, times in s.
+        A readings file (CSV): fields in nT, times in s. Or a log whose channels the array's columns name.
     array : SensorArray
         Array whose sensors the file must have, with a column for each channel.
     sensors : sequence of str, optional
@@ -277,7 +278,7 @@ def read_readings(
     (101, 90)
     """
     form = log_format(array, sensors)
-    table, error_m = without_gaps(form.table(read_text(path, "a CSV file", form.encoding), str(path)))
+    table, error_m = without_gaps(table_of_file(path, form))
     if array.columns is not None:
         table = turned_to_course(table, array, array.columns)
     readings = replace(readings_of_table(table, array, sensors), interpolated_m=error_m)

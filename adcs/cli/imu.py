@@ -42,7 +42,9 @@ def imu(
     log : Path
         CSV file with time_s, gyro_x_rad_s or gyro_x_deg_s, acceleration_x_m_s2 and, with a magnetometer, field_x_nT,
         each with y and z; if known the truth qw, qx, qy, qz (east, north, up from body) and moving (1 where errors
-        count). Empty cells are missing readings. Or a MAT file of the BROAD benchmark.
+        count). Empty cells are missing readings. Or a MAT file of the BROAD benchmark. Or the log of an autopilot or
+        robot (PX4 ULog, ArduPilot DataFlash, ROS bag): its sensors are found by their names, in its body axes, and the
+        attitude is compared with its own.
     config : Path, optional
         TOML file whose table log states other names of columns, units and mountings.
     method : str
@@ -65,7 +67,13 @@ def imu(
     if report.out is not None:
         from adcs.plots.inertial import inertial_figure
 
-        picture = inertial_figure(track, log.stem, data.q_true)
+        if data.q_true is None and data.q_autopilot is not None:
+            from adcs.complementary.orientation_errors import without_heading_offset
+
+            own = without_heading_offset(track.q, data.q_autopilot)[0]
+            picture = inertial_figure(track, log.stem, own, "difference from the autopilot")
+        else:
+            picture = inertial_figure(track, log.stem, data.q_true)
         report.write([("attitude.csv", attitude_columns(track)), ("attitude.png", picture)])
     report.print(summary, summary_words(summary))
 

@@ -1,4 +1,4 @@
-"""Logs of an inertial unit with or without a magnetometer: CSV files, and MAT files of the BROAD benchmark.
+"""Logs of an inertial unit with or without a magnetometer: CSV files, MAT files of BROAD, logs of autopilots.
 
 A CSV file without a layout has the columns ``time_s``, ``gyro_x_rad_s`` or ``gyro_x_deg_s``, ``acceleration_x_m_s2``
 and, with a magnetometer, ``field_x_nT``, each also for y and z. Optional columns are the truth ``qw, qx, qy, qz``
@@ -27,6 +27,7 @@ from adcs.io.log_layout import (
     StarColumns,
     Three,
 )
+from adcs.io.robot_logs import robot_record
 from adcs.io.telemetry_files import TIME, columns_of, read_named
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.csv import read_table
@@ -34,6 +35,7 @@ from arrays.io.errors import LARGEST, InputError, naming
 from arrays.io.text import read_bytes
 from arrays.io.toml import File, Table, one_of, read_toml, section_of
 from arrays.typing import BoolArray, FloatArray
+from magloc.logs.read import log_reader, read_log
 
 MOVING = "moving"
 _BROAD = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "opt_pos": 3, "movement": 1}
@@ -95,6 +97,10 @@ class ImuLog:
         Rows in which errors count; all rows unless the file states them.
     position_m : ndarray, shape (n, 3), optional
         True position, east, north, up, NaN where unknown.
+    q_autopilot : ndarray, shape (n, 4), optional
+        Attitude that the autopilot itself estimated, as `q_true`.
+    magnetometer_lag_s : tuple of 2 floats, optional
+        Lag of the magnetometer behind the gyro and its standard deviation, of the log of an autopilot.
 
     Examples
     --------
@@ -108,6 +114,8 @@ class ImuLog:
     q_true: FloatArray | None
     moving: BoolArray
     position_m: FloatArray | None = None
+    q_autopilot: FloatArray | None = None
+    magnetometer_lag_s: tuple[float, float] | None = None
 
 
 def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = None) -> ImuLog:
@@ -116,7 +124,7 @@ def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = Non
     Parameters
     ----------
     path : str or path-like
-        CSV file, or MAT file of the BROAD benchmark.
+        CSV file, MAT file of the BROAD benchmark, or log of PX4 (.ulg), ArduPilot (.BIN) or ROS.
     layout : str or path-like, optional
         TOML file whose table ``log`` names columns, units and mountings of a CSV file; see the file formats. Without a
         table of the magnetometer its columns are ignored.
@@ -138,7 +146,8 @@ def read_imu(path: str | PathLike[str], layout: str | PathLike[str] | None = Non
     >>> len(log.record)
     1500
     """
-    described = None if layout is None or _is_matlab(path) else read_toml(layout, "a layout of a log")
+    has_columns = not _is_matlab(path) and log_reader(path) is None
+    described = None if layout is None or not has_columns else read_toml(layout, "a layout of a log")
     return imu_log(path, None if layout is None else (str(layout), described or {}))
 
 
@@ -148,11 +157,19 @@ def _is_matlab(path: str | PathLike[str]) -> bool:
 
 def imu_log(path: str | PathLike[str], layout: tuple[str, dict[str, Any]] | None) -> ImuLog:
     """Return the log of :func:`read_imu`; ``layout`` is the path and the table of a layout that is already read."""
-    if not _is_matlab(path):
+    is_binary = log_reader(path) is not None
+    if not _is_matlab(path) and not is_binary:
         return _csv_log(path, None if layout is None else section_of(*layout, ImuFile).log)
     if layout is not None:
-        raise InputError(f"{path}: found a MAT file with a layout, expected a CSV file, or none.")
-    return _broad_log(path)
+        kind = "the log of an autopilot" if is_binary else "a MAT file"
+        raise InputError(f"{path}: found {kind} with a layout, expected a CSV file, or none.")
+    return _autopilot_log(path) if is_binary else _broad_log(path)
+
+
+def _autopilot_log(path: str | PathLike[str]) -> ImuLog:
+    found = robot_record(read_log(path))
+    every = np.ones(len(found.record), np.bool_)
+    return ImuLog(found.record, None, every, None, found.own_attitude, found.lag_s)
 
 
 def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:

@@ -16,8 +16,10 @@ _MOST_POINTS = 4000
 _GAP_STEPS = 20.0  # usual steps; no line crosses a longer gap
 
 
-def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None = None) -> Figure:
-    """Draw yaw, pitch and roll, and σ of heading and tilt, with errors by a truth (n, 4)."""
+def inertial_figure(
+    track: AttitudeTrack, name: str, q_true: FloatArray | None = None, compared: str = "error"
+) -> Figure:
+    """Draw yaw, pitch and roll, and σ of heading and tilt, with errors by a truth (n, 4), or what else is compared."""
     every = slice(None, None, max(1, len(track) // _MOST_POINTS))
     time_s = track.time_s[every]
     steps_s = np.diff(time_s, prepend=time_s[0])
@@ -36,7 +38,7 @@ def inertial_figure(track: AttitudeTrack, name: str, q_true: FloatArray | None =
     ):
         if errors is not None:
             shown = (errors[i] + 180.0) % 360.0 - 180.0
-            ax.plot(time_s, np.where(is_gap, np.nan, np.abs(shown)), color=style.BLUE, lw=0.7, label="error")
+            ax.plot(time_s, np.where(is_gap, np.nan, np.abs(shown)), color=style.BLUE, lw=0.7, label=compared)
         ax.plot(time_s, np.where(is_gap, np.nan, values), color=style.ORANGE, lw=1.1, ls="--", label="σ")
         ax.set_ylim(bottom=0.0)
         style.label_axes(ax, "", f"{word} [°]")

@@ -188,6 +188,11 @@ class LogFormat:
         return Table(logged.path, tuple(found), logged.header_line, values, logged.line_numbers, logged.labels)
 
     @property
+    def wanted(self) -> tuple[str, ...]:
+        """Columns of the log that are read; none for a readings file."""
+        return () if self.columns is None else self._theirs(self.columns)
+
+    @property
     def _own(self) -> set[str]:
         return {name for of_sensor in self.channels.values() for name in of_sensor}
 
@@ -198,10 +203,10 @@ class LogFormat:
         return tuple(dict.fromkeys((*columns.clock, *named, *columns.place, *columns.attitude, *flags)))
 
 
-def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
+def log_origin(path: str | PathLike[str], columns: LogColumns, table: Table | None = None) -> Vector:
     """Return latitude, longitude [deg] and height [m] of the first position of a log.
 
-    The height is 0 if the log has heights above ground.
+    The height is 0 if the log has heights above ground. ``table``: that of a log that is no text.
 
     Raises
     ------
@@ -210,8 +215,8 @@ def log_origin(path: str | PathLike[str], columns: LogColumns) -> Vector:
     """
     if columns.track is not None:
         return log_origin(columns.track.path, columns.track.columns)
-    for table in _begins(path, columns):
-        place = geodetic_places(table, columns, is_file=True)
+    for part in _begins(path, columns) if table is None else (table,):
+        place = geodetic_places(part, columns, is_file=True)
         known = place[np.isfinite(place).all(axis=1)]
         if len(known):
             latitude, longitude, height = known[0].tolist()

@@ -63,6 +63,10 @@ class Proposal:
         Questions that the log leaves open.
     header_line : int
         Line of the header.
+    about : str
+        Sentence about a log without lines, in place of that about the header.
+    sensor_lines : tuple of str
+        Further lines of the table of each sensor.
     """
 
     channels: dict[str, str]
@@ -70,17 +74,20 @@ class Proposal:
     sensors: dict[str, str | tuple[str, ...]]
     asked: list[str]
     header_line: int
+    about: str = ""
+    sensor_lines: tuple[str, ...] = ()
 
     def toml(self) -> str:
         """Return the text of an array file with the table, and comments with open questions."""
         said = "rows begin" if "names" in self.keys else "header is"
-        lines = [f"# The {said} on line {self.header_line}. Columns, with their first values:"]
+        about = self.about or f"The {said} on line {self.header_line}. Columns, with their first values:"
+        lines = [f"# {about}"]
         lines += [f"#   {name}: {cell}" for name, cell in self.channels.items()]
         lines += [f"# Asked: {question}" for question in self.asked]
         for name, of in self.sensors.items():
             kind = "scalar" if isinstance(of, str) else "vector"
             lines += ["", "[[sensor]]", f'id = "{name}"', f'kind = "{kind}"', "position_m = [0.0, 0.0, 0.0]  # asked"]
-            lines += ["noise_nT = 1.0  # asked"]
+            lines += ["noise_nT = 1.0  # asked", *self.sensor_lines]
         lines += ["", "[columns]", *(f"{key} = {toml_value(value)}" for key, value in self.keys.items())]
         lines += ["", "[columns.sensors]", *(f"{name} = {toml_value(of)}" for name, of in self.sensors.items())]
         return "\n".join([*lines, ""])

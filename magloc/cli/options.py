@@ -281,18 +281,18 @@ class KnownOptions:
         columns = array.columns
         if columns is None or not (columns.is_geodetic or self.place is not None):
             return array, self
-        from arrays.logs.format import log_date, log_origin
+        from magloc.logs.readings_table import date_of_log, origin_of_log
 
         if columns.is_geodetic and columns.origin is None:
             from arrays.io.world_maps import place_in_words
 
-            origin, placed = log_origin(log, columns), log if columns.track is None else columns.track.path
+            origin, placed = origin_of_log(log, columns), log if columns.track is None else columns.track.path
             array = replace(array, columns=replace(columns, origin=origin))
             note(f"note: the origin of the world frame is the first place of {placed}: {place_in_words(origin)}")
         date = self.date
         is_known = array.ambient_T is not None or array.ambient_world_T is not None
         if date is None and array.channel_is_scalar.any() and not is_known:
-            date = columns.date or log_date(log, columns)
+            date = columns.date or date_of_log(log, columns)
         return array, replace(self, place=self.map_origin(array), date=date)
 
     @property

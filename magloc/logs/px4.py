@@ -82,6 +82,8 @@ def _topics(message: Any) -> Iterator[Topic]:
         stamp = columns["timestamp"]
     time_us = stamp.astype(np.int64)
     fields = {field: of for field, of in columns.items() if field not in ("timestamp", "timestamp_sample")}
+    if message.name == "vehicle_attitude" and "q[3]" in fields:
+        fields |= _angles_deg(fields)
     units = {field: _unit(str(message.name), field) for field in fields}
     units = {field: unit for field, unit in units.items() if unit.logged}
     whole = Topic(name, _seconds(time_us), fields, units, "boot")
@@ -95,6 +97,15 @@ def _topics(message: Any) -> Iterator[Topic]:
         yield replace(whole, time_s=_seconds(own_us[is_new]), fields={field: of[is_new] for field, of in own.items()})
         fields = {field: of for field, of in fields.items() if field not in own}
     yield replace(whole, fields=fields)
+
+
+def _angles_deg(fields: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return yaw, pitch and roll (n,) [deg] of the quaternion, from north, east, down to forward, right, down."""
+    w, x, y, z = (fields[f"q[{i}]"].astype(np.float64) for i in range(4))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    return {"yaw_deg": np.degrees(yaw), "pitch_deg": np.degrees(pitch), "roll_deg": np.degrees(roll)}
 
 
 def _seconds(time_us: NDArray[Any]) -> FloatArray:

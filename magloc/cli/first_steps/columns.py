@@ -28,7 +28,8 @@ def columns(
     Parameters
     ----------
     log : Path
-        Text file with a header and rows of numbers.
+        Text file with a header and rows of numbers, or a binary log: PX4 ULog, ArduPilot DataFlash, a ROS bag, MCAP,
+        Parquet, HDF5, TDMS.
     instrument : str
         Instrument that wrote the log, such as magarrow or gsm19. An unknown name lists all.
     out : Path
@@ -37,6 +38,8 @@ def columns(
         Common options.
     """
     from arrays.logs.proposal import propose_columns
+    from magloc.logs.proposal import propose_log_columns
+    from magloc.logs.read import log_reader, read_log
 
     refuse_unwritable(out, "--out")
     if instrument is not None:
@@ -46,7 +49,7 @@ def columns(
         else:
             write_text(text, out)
         return
-    proposal = propose_columns(log)
+    proposal = propose_columns(log) if log_reader(log) is None else propose_log_columns(read_log(log))
     if out is None:
         print(proposal.toml(), end="")
         return

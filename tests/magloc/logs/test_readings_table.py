@@ -1,0 +1,124 @@
+"""Binary logs by the table [columns]: readings against the flight that made them, and the proposal of that table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+
+import arrays
+import magloc
+from arrays.io.errors import InputError
+from magloc.logs.readings_table import date_of_log, origin_of_log
+from tests.robot_flights import Flight
+from tests.written_logs import ulog
+
+FLIGHT = Flight(2, duration_s=20.0, noise_T=0.0)
+SENSOR = '[[sensor]]\nid = "s1"\nkind = "vector"\nposition_m = [0.0, 0.0, 0.0]\nnoise_nT = 1.0\n'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("logs")
+    (path / "flight.ulg").write_bytes(FLIGHT.px4())
+    (path / "flight.BIN").write_bytes(FLIGHT.ardupilot())
+    return path
+
+
+@pytest.mark.parametrize(("name", "error_T"), [("flight.ulg", 1e-11), ("flight.BIN", 5.1e-8)])
+def test_the_proposed_table_reads_the_flight(run, folder: Path, name: str, error_T: float) -> None:
+    """DataFlash has whole milligauss, 100 nT."""
+    array_file = folder / f"{name}.toml"
+    assert run("columns", folder / name, "--out", array_file).status == 0
+    array = arrays.read_sensors(array_file)
+    readings = magloc.read_readings(folder / name, array, ordered=True)
+    expected = FLIGHT.field_T(FLIGHT.field_s)
+    np.testing.assert_allclose(readings.time_s, 10.0 + FLIGHT.field_s, atol=1e-6)
+    np.testing.assert_allclose(readings.values_T, expected, rtol=0.0, atol=error_T)
+    np.testing.assert_allclose(array.sensors[0].rotation_xyzw, [1.0, 0.0, 0.0, 0.0])
+
+
+def test_places_and_angles_come_to_the_rows_of_the_sensor(run, tmp_path: Path) -> None:
+    """A vehicle that drives to the north at 1 m/s and turns from 350 to 10 degrees."""
+    us = np.arange(0, 10_000_000, 20_000, dtype=np.uint64)
+    gps_us = np.arange(0, 10_000_000, 200_000, dtype=np.uint64)
+    yaw = np.radians(350.0 + 2e-6 * us)
+    q = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1).astype(np.float32)
+    north_m = 1e-6 * gps_us.astype(float)
+    gps = {
+        "timestamp": gps_us,
+        "lat": np.round(1e7 * (48.0 + np.degrees(north_m / 6.3674e6))).astype(np.int32),
+        "lon": np.full(len(gps_us), 110_000_000, np.int32),
+        "alt": np.full(len(gps_us), 500_000, np.int32),
+    }
+    mag = {"timestamp": us + np.uint64(7_000), "magnetometer_ga": np.tile(np.float32([0.2, 0.01, 0.43]), (len(us), 1))}
+    mag["magnetometer_ga"][:, 0] += np.linspace(0.0, 0.01, len(us), dtype=np.float32)
+    attitude = {"timestamp": us, "q": q}
+    path = tmp_path / "drive.ulg"
+    path.write_bytes(
+        ulog([("vehicle_gps_position", 0, gps), ("vehicle_magnetometer", 0, mag), ("vehicle_attitude", 0, attitude)])
+    )
+    assert run("columns", path, "--out", tmp_path / "a.toml").status == 0
+    readings = magloc.read_readings(path, arrays.read_sensors(tmp_path / "a.toml"))
+    checked = run("qc", path, "--array", tmp_path / "a.toml", "--json")
+    assert (checked.status, json.loads(checked.out)["checks"][0]["value"]) == (0, len(readings))
+    inside = readings.time_s < 9.7
+    np.testing.assert_allclose(readings.array_position_m[inside, 1], readings.time_s[inside], atol=0.02)
+    heading = np.radians(350.0 + 2.0 * readings.time_s[inside])
+    nose = readings.array_rotation[np.flatnonzero(inside)].apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(nose, np.stack([np.sin(heading), np.cos(heading), 0 * heading], 1), atol=1e-3)
+
+
+def test_paths_of_hdf5(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file["lab/field"] = 1e3 * np.arange(30.0).reshape(10, 3)
+        file["lab/ticks"] = np.arange(10) * 5
+    names = json.dumps([f"lab/field[{i}]" for i in range(3)])
+    columns = f'[columns]\ntime = "lab/ticks"\ntime_unit = "ms"\n[columns.sensors]\ns1 = {names}\n'
+    (tmp_path / "a.toml").write_text(SENSOR + columns)
+    readings = magloc.read_readings(tmp_path / "log.h5", arrays.read_sensors(tmp_path / "a.toml"))
+    np.testing.assert_allclose(readings.time_s, 0.005 * np.arange(10))
+    np.testing.assert_allclose(readings.values_T, 1e-6 * np.arange(30.0).reshape(10, 3), rtol=1e-12)
+
+
+def test_parquet_with_the_columns_of_a_readings_file(tmp_path: Path) -> None:
+    columns = {"time_s": np.arange(5.0), **{f"s1_{axis}_nT": np.arange(5.0) + i for i, axis in enumerate("xyz")}}
+    pd.DataFrame(columns).to_parquet(tmp_path / "log.parquet")
+    (tmp_path / "a.toml").write_text(SENSOR)
+    readings = magloc.read_readings(tmp_path / "log.parquet", arrays.read_sensors(tmp_path / "a.toml"))
+    np.testing.assert_allclose(readings.values_T[:, 2], 1e-9 * (np.arange(5.0) + 2.0))
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ("", r"key columns\.unit: found nT for .* in G, expected unit = 100000 \(nT\)"),
+        ('unit = "G"\ntime = "clock"', "found no channel clock"),
+    ],
+)
+def test_faults_of_the_table_are_named(folder: Path, tmp_path: Path, columns: str, words: str) -> None:
+    names = [f"vehicle_magnetometer.magnetometer_ga[{i}]" for i in range(3)]
+    (tmp_path / "a.toml").write_text(f"{SENSOR}[columns]\n{columns}\n[columns.sensors]\ns1 = {json.dumps(names)}\n")
+    with pytest.raises(InputError, match=words):
+        magloc.read_readings(folder / "flight.ulg", arrays.read_sensors(tmp_path / "a.toml"))
+
+
+def test_the_proposal_lists_all_messages_and_asks(run, folder: Path) -> None:
+    said = run("columns", folder / "flight.BIN").out
+    assert "# ArduPilot DataFlash." in said
+    assert "#   IMU: 5000 rows, 250 Hz: GyrX [rad/s], GyrY [rad/s]" in said
+    assert 'unit = "mG"' in said
+    assert "# Asked: no channels of a place were found" in said
+
+
+def test_a_log_states_its_date_by_its_receiver(data_folder: Path) -> None:
+    """The receiver of the autopilot states the 21st of April 2021, 06:30 UTC, at the start."""
+    path = data_folder / "flight-logs" / "sample_log_small.ulg"
+    assert date_of_log(path, arrays.LogColumns()) == "2021-04-21"
+    names = tuple(f"vehicle_gps_position.{name}" for name in ("lat", "lon", "alt"))
+    origin = origin_of_log(path, arrays.LogColumns(geodetic=names))
+    np.testing.assert_allclose(origin, [63.4170622, 10.4082151, 66.814], rtol=1e-7)
