@@ -31,12 +31,14 @@ from adcs.io.scenario_tables import (
     StartTable,
 )
 from adcs.kalman.bank import IMPLIED_STATES, EstimatorSettings
-from adcs.kalman.error_state import FilterSettings, ProcessNoise, SensorSet, paper_noise, sensor_set, tuned_noise
+from adcs.kalman.error_state import DISTURBANCE_S2, FilterSettings, ProcessNoise, SensorSet, sensor_set
 from adcs.kalman.names import FILTERS, NOISES, STARTS
+from adcs.kalman.process_noise import paper_noise, torque_scale, tuned_noise
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
 from adcs.satellite.satellite import Satellite
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import BuiltIn, section_of, toml_value
+from arrays.typing import FloatArray
 from magloc.fields.geomagnetic import Model
 
 _FILES = BuiltIn("adcs", "scenarios", "scenario")
@@ -73,7 +75,7 @@ class AttitudeFile:
 
     def estimator(self, place: str = "") -> EstimatorSettings:
         """Return the settings of the table ``estimate``; errors name ``place``, by default the file."""
-        return _estimator(place or self.path, self.estimate)
+        return _estimator(place or self.path, self.estimate, self.satellite.body.inertia_kgm2)
 
 
 def read_scenario(name_or_path: str, *, allow_old_elements: bool = False) -> AttitudeFile:
@@ -170,7 +172,7 @@ def scenario_of(path: str, tables: dict[str, Any], *, allow_old_elements: bool =
     )
 
 
-def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
+def _estimator(place: str, table: EstimateTable, inertia_kgm2: FloatArray) -> EstimatorSettings:
     for key, known in (("filter", FILTERS), ("start", STARTS)):
         if getattr(table, key) not in known:
             raise InputError(f"{place}, {key}: found {getattr(table, key)!r}, expected one of {', '.join(known)}.")
@@ -184,11 +186,11 @@ def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
         return EstimatorSettings(
             settings=FilterSettings(
                 used,
-                _process_noise(place, table.process_noise, used),
+                _process_noise(place, table.process_noise, used, inertia_kgm2),
                 field_error_T=1e-9 * table.field_model_error_nT,
                 field_bias_sigma_T=1e-9 * table.field_bias_nT,
                 gyro_bias_sigma_rad_s=math.radians(table.gyro_bias_deg_s),
-                disturbance_sigma_s2=table.disturbance_s2,
+                disturbance_sigma_s2=table.disturbance_s2 or DISTURBANCE_S2 * torque_scale(inertia_kgm2),
                 dipole_sigma_Am2=table.dipole_Am2,
                 field_gain_sigma=table.field_gain,
                 field_axes_sigma_rad=math.radians(table.field_axes_deg),
@@ -205,10 +207,10 @@ def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
         )
 
 
-def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet) -> ProcessNoise:
+def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet, inertia_kgm2: FloatArray) -> ProcessNoise:
     if wanted == "paper":
         return paper_noise(used)
-    tuned = tuned_noise(used)
+    tuned = tuned_noise(used, inertia_kgm2)
     if wanted == "tuned":
         return tuned
     if isinstance(wanted, str):

@@ -7,13 +7,30 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warning_sentences
-from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, FilterStart, sensor_set, tuned_noise
+from adcs.kalman.diagnostics import (
+    COLLINEAR,
+    FALSE_ALARM,
+    collinear_rows,
+    contradicts_model,
+    unseen_torque_Nm,
+    warning_sentences,
+)
+from adcs.kalman.error_state import (
+    ALWAYS,
+    DISTURBANCE_S2,
+    AttitudeTracks,
+    FilterSettings,
+    FilterStart,
+    sensor_set,
+)
 from adcs.kalman.initialisation import any_start, choose_start, first_observed_row, vector_start
 from adcs.kalman.mekf import run_filter
-from adcs.kalman.names import FILTERS, Filter, StartKind
+from adcs.kalman.names import FILTERS, Filter, StartKind, grouped_states
+from adcs.kalman.process_noise import torque_scale, tuned_noise
 from adcs.kalman.smoother import smooth
 from adcs.kalman.variants.constant_gain import run_constant_gain
 from adcs.kalman.variants.gyro_driven import run_reduced
@@ -28,6 +45,14 @@ from arrays.io.errors import InputError, naming
 
 IMPLIED_STATES = {"parallel-disturbance": ("disturbance",), "reduced": ("gyro-bias",), "self-tuning": ("disturbance",)}
 """States that a filter always estimates."""
+_CURES = (
+    ("disturbance",),
+    ("dipole",),
+    ("disturbance", "dipole"),
+    ("field-model",),
+    ("disturbance", "dipole", "field-model"),
+)
+_MOST_TRIED = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +94,13 @@ class EstimatorSettings:
     longest_gap_s: float = 600.0
 
     @classmethod
-    def of(cls, sensors: str, states: Iterable[str] = (), filter: Filter = "mekf") -> EstimatorSettings:
+    def of(
+        cls,
+        sensors: str,
+        states: Iterable[str] = (),
+        filter: Filter = "mekf",
+        inertia_kgm2: ArrayLike | None = None,
+    ) -> EstimatorSettings:
         """Return settings by names, with tuned process noise.
 
         Parameters
@@ -80,6 +111,8 @@ class EstimatorSettings:
             States besides attitude and rate.
         filter : str
             One of :data:`adcs.kalman.names.FILTERS`.
+        inertia_kgm2 : array_like, shape (3, 3), optional
+            Inertia of the satellite; the smaller it is, the more process noise. By default that of TabletSat-Aurora.
 
         Returns
         -------
@@ -94,7 +127,8 @@ class EstimatorSettings:
         if filter not in FILTERS:
             raise ValueError(f"Input filter must be one of {', '.join(FILTERS)}; instead received {filter!r}.")
         used = sensor_set(sensors, dict.fromkeys((*states, *IMPLIED_STATES.get(filter, ()))))
-        return cls(FilterSettings(used, tuned_noise(used)), filter)
+        prior_s2 = DISTURBANCE_S2 * torque_scale(inertia_kgm2)
+        return cls(FilterSettings(used, tuned_noise(used, inertia_kgm2), disturbance_sigma_s2=prior_s2), filter)
 
     @property
     def in_words(self) -> str:
@@ -156,7 +190,8 @@ def estimate(
     >>> bool(error < 1e-3)
     True
     """
-    chosen = EstimatorSettings.of(sensors, states, filter) if isinstance(sensors, str) else sensors
+    body = satellite.body
+    chosen = EstimatorSettings.of(sensors, states, filter, body.inertia_kgm2) if isinstance(sensors, str) else sensors
     pieces = telemetry.pieces(chosen.longest_gap_s)
     if len(pieces) == 1:
         return _estimate(telemetry, satellite, chosen)
@@ -190,7 +225,52 @@ def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSetti
     if not (np.isfinite(tracks.q).all() and tracks.definite.all()):
         raise ValueError("Input telemetry must have readings that an attitude explains; instead the filter found none.")
     track = _track(telemetry, first, record, chosen, tracks)
-    return replace(track, warnings=(*warnings, *track.warnings))
+    return replace(track, warnings=(*warnings, *track.warnings, *_missing_states(record, chosen, tracks)))
+
+
+def _missing_states(record: Record, chosen: EstimatorSettings, tracks: AttitudeTracks) -> list[str]:
+    """Return a sentence on states that explain the readings better, where these contradict the model.
+
+    Filters with more states run over the first :data:`_MOST_TRIED` instants. The likeliest of those without a
+    contradiction is named; without one, the likeliest of all.
+    """
+    used = chosen.settings.sensors
+    if chosen.filter not in ("mekf", "smoother") or not contradicts_model(record, tracks, 0):
+        return []
+    rows = slice(_MOST_TRIED)
+    start, inertia = part(record, np.array([0]), rows), record.satellite.body.inertia_kgm2
+    limit = _misfit(tracks, rows) - chi2.isf(FALSE_ALARM, 9)
+    found: list[tuple[bool, float, tuple[str, ...]]] = []
+    for added in _CURES:
+        if "field-model" in added and not used.magnetometer:
+            continue
+        trial = sensor_set(used.sensors, dict.fromkeys((*used.states, *added)))
+        if trial.states == used.states:
+            continue
+        settings = replace(
+            chosen.settings,
+            sensors=trial,
+            noise=tuned_noise(trial, inertia),
+            disturbance_sigma_s2=max(chosen.settings.disturbance_sigma_s2, DISTURBANCE_S2 * torque_scale(inertia)),
+        )
+        tried = estimate_tracks(start, replace(chosen, settings=settings, filter="mekf"), any_start)
+        if (misfit := _misfit(tried, rows)) < limit:
+            found.append((contradicts_model(start, tried, 0), misfit, trial.states))
+    if not found:
+        return []
+    names = ", ".join(f'"{state}"' for state in grouped_states(min(found)[2]))
+    return [
+        f"the readings fit better with states = [{names}] in the table estimate: a torque or a field is not in the "
+        "model, such as that of a residual dipole, or of an error of the orbit"
+    ]
+
+
+def _misfit(tracks: AttitudeTracks, rows: slice) -> float:
+    """Return minus twice the log-likelihood of the readings of some rows of the first run; infinite if it fails."""
+    if not np.isfinite(tracks.q).all():
+        return math.inf
+    nis = np.minimum(tracks.nis[0, rows], tracks.settings.gate_limit)
+    return float(np.nansum(nis + tracks.log_det[0, rows]))
 
 
 def _track(

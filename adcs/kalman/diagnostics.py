@@ -79,6 +79,11 @@ def warning_sentences(record: Record, estimates: AttitudeTracks) -> tuple[tuple[
     return tuple(tuple(problem.text for problem in of_run) for of_run in find_problems(record, estimates))
 
 
+def contradicts_model(record: Record, estimates: AttitudeTracks, run: int) -> bool:
+    """Return whether innovations or residuals of a run are larger than the model explains."""
+    return bool(_innovations(estimates, run) or _correlated_residuals(record, estimates, run))
+
+
 def collinear_rows(record: Record, used: SensorSet, run: int) -> BoolArray:
     """Return the instants (n,) at which Sun and field, the only directions, are on one line."""
     if used.star or not (used.magnetometer and used.sun):

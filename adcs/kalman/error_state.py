@@ -1,9 +1,4 @@
-"""Sensors, optional states and process noise of an attitude filter.
-
-See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
-2014, Tables 3 to 5. Ours: the exponents of :func:`paper_noise`, which are missing or uncertain there. They give the
-accuracy that the tables state.
-"""
+"""Sensors, optional states and settings of an attitude filter. See docs/theory/attitude-kalman-filters.md."""
 
 from __future__ import annotations
 
@@ -26,6 +21,8 @@ SIZES = {"field-bias": 3, "gyro-bias": 3, "disturbance": 3, "field-model": 3, "d
 STATES = tuple(SIZES)
 FIELD_ERROR_T = 150e-9
 """Error of each component of a model of the core field: crust, currents around the Earth, and the model itself."""
+DISTURBANCE_S2 = 2e-6
+"""Standard deviation of the state ``disturbance`` at the start, for a least moment of inertia of 0.5 kg·m²."""
 OPEN_RAD = 2.0
 """Standard deviation of the angle about an unknown axis, close to that of a uniform distribution."""
 RATE_RAD_S = math.radians(0.5)
@@ -161,61 +158,6 @@ class ProcessNoise:
         check_not_negative(**vars(self))
 
 
-def tuned_noise(used: SensorSet) -> ProcessNoise:
-    """Return process noise that makes the filter accurate and consistent.
-
-    It is tuned for a constant torque of 8e-7 N·m; with the state ``dipole`` and without ``disturbance``, for one of up
-    to 1e-8 N·m besides that of the dipole.
-    """
-    if "dipole" in used.states:
-        # Only whole orbits separate a dipole from other torques; larger process noise would hide it.
-        if "disturbance" in used.states:
-            return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-10)
-        return ProcessNoise(1e-8, 2e-7)
-    if "disturbance" in used.states:
-        # The torque is a state, so the rate needs almost no noise of its own.
-        if used.star and "gyro-bias" not in used.states:
-            return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-8)
-        return ProcessNoise(1e-8, 1e-7, disturbance_s2=1e-8)
-    # The torque changes the rate by up to 1.5e-6 rad/s a step. A star tracker observes that within seconds; vectors
-    # average over minutes, in which a constant torque is far from white: ten times the noise keeps NEES consistent.
-    return ProcessNoise(1e-8, 1.5e-6) if used.star else ProcessNoise(1e-8, 1.5e-5)
-
-
-PAPER_NOISE: dict[tuple[str, tuple[str, ...]], ProcessNoise] = {
-    # Table 3. Mantissas are printed, exponents are ours. Field biases are printed for a field of unit length: they are
-    # multiplied by 40 µT here.
-    ("st+gyro+mag+sun", ()): ProcessNoise(1e-5, 1.2e-6),
-    ("st+gyro+mag", ()): ProcessNoise(1e-5, 1.2e-6),
-    ("st+gyro", ()): ProcessNoise(1e-5, 1.2e-6),
-    ("st+mag+sun", ()): ProcessNoise(1e-5, 1.2e-6),
-    ("st+mag", ("field-bias",)): ProcessNoise(1e-5, 1.2e-6, field_bias_T=40e-9),
-    ("st+gyro", ("gyro-bias",)): ProcessNoise(1e-5, 1.2e-6, gyro_bias_rad_s=1e-5),
-    ("gyro+mag+sun", ()): ProcessNoise(5e-6, 5e-4),
-    ("gyro+mag+sun", ("gyro-bias",)): ProcessNoise(1e-6, 3e-4, gyro_bias_rad_s=1e-6),
-    ("gyro+mag+sun", ("field-bias",)): ProcessNoise(5e-6, 3e-4, field_bias_T=20e-9),
-    ("mag+sun", ()): ProcessNoise(5e-3, 2e-5),
-    ("gyro+mag", ()): ProcessNoise(1e-4, 5e-4),
-    ("st", ()): ProcessNoise(1e-5, 1.2e-6),
-    # Table 4.
-    ("st", ("disturbance",)): ProcessNoise(3e-7, 3e-7, disturbance_s2=5e-9),
-    ("st+gyro", ("gyro-bias", "disturbance")): ProcessNoise(3e-7, 3e-7, gyro_bias_rad_s=1e-8, disturbance_s2=5e-9),
-    ("mag+sun", ("disturbance",)): ProcessNoise(1e-5, 5e-6, disturbance_s2=5e-8),
-    ("gyro+mag+sun", ("gyro-bias", "disturbance")): ProcessNoise(1e-6, 3e-6, gyro_bias_rad_s=1e-7, disturbance_s2=5e-8),
-}
-
-
-def paper_noise(used: SensorSet) -> ProcessNoise:
-    """Return the process noise of the source's tables."""
-    try:
-        return PAPER_NOISE[used.sensors, used.states]
-    except KeyError:
-        raise ValueError(
-            f"Input used must be a set of the source's tables; instead received {used.sensors!r} with the states "
-            f"{list(used.states)}."
-        ) from None
-
-
 @dataclass(frozen=True)
 class FilterSettings:
     """Settings of an attitude filter.
@@ -249,7 +191,7 @@ class FilterSettings:
     field_error_T: float = 0.0
     field_bias_sigma_T: float = 1000e-9
     gyro_bias_sigma_rad_s: float = 1e-3
-    disturbance_sigma_s2: float = 2e-6
+    disturbance_sigma_s2: float = DISTURBANCE_S2
     dipole_sigma_Am2: float = 0.1
     field_gain_sigma: float = 0.05
     field_axes_sigma_rad: float = math.radians(1.0)

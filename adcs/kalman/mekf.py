@@ -120,6 +120,16 @@ def propagate(record: Record, row: int, state: AttitudeState) -> tuple[FloatArra
     return q, w
 
 
+def added_variance(record: Record, settings: FilterSettings, step_s: float | FloatArray) -> FloatArray:
+    """Return the diagonal of Q, (N,), or (k, N) for steps (k, 1), with the stated walks of the sensors' biases."""
+    variance, satellite = settings.process_variance(step_s, record.dt_s), record.satellite
+    walks = {"gyro-bias": satellite.gyro.bias_walk_rad_s, "field-bias": satellite.magnetometer.bias_walk_T}
+    for state, walk in walks.items():
+        if state in settings.sensors.states:
+            variance[..., settings.sensors.slice_of(state)] += walk**2 * np.asarray(step_s)
+    return variance
+
+
 def predict(
     record: Record, row: int, state: AttitudeState, settings: FilterSettings
 ) -> tuple[AttitudeState, FloatArray]:
@@ -135,7 +145,7 @@ def predict(
     F = 0.5 * (known_torque_jacobian(record, row, state) + known_torque_jacobian(record, row + 1, ahead))
     by_dipole = 0.5 * (acceleration_by_dipole(record, row, state) + acceleration_by_dipole(record, row + 1, ahead))
     Phi = transition(F, by_dipole, settings, step_s)
-    P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(step_s, record.dt_s))
+    P = Phi @ state.P @ Phi.mT + np.diag(added_variance(record, settings, step_s))
     return replace(ahead, P=0.5 * (P + P.mT)), Phi * decay
 
 
@@ -343,7 +353,7 @@ def run_filter(
         "first_covariance": first.P,
         "sigma": sigma,
         "kept": settings.decay(record.steps_s[:, None]),
-        "added_variance": settings.process_variance(record.steps_s[:, None], record.dt_s),
+        "added_variance": added_variance(record, settings, record.steps_s[:, None]),
         "open_variance": settings.open_variance,
     }
     places = [_first_index(used, state, part) for state in STATES for part in range(SIZES[state] // 3)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 Filter = Literal["mekf", "constant-gain", "parallel-disturbance", "reduced", "smoother", "self-tuning"]
@@ -25,3 +26,12 @@ MEASURED_BY = {
 def is_measured(state: str, sensors: str) -> bool:
     """Return whether sensors, joined by plus signs, include the sensor that a state needs."""
     return state not in MEASURED_BY or MEASURED_BY[state] in sensors.split("+")
+
+
+def grouped_states(states: Sequence[str]) -> list[str]:
+    """Return states with those of a group replaced by its name, the torques last."""
+    names = list(states)
+    for group, members in TOGETHER.items():
+        if set(members) <= set(names):
+            names = [group, *(name for name in names if name not in members)]
+    return sorted(names, key=lambda name: name in ("disturbance", "dipole"))

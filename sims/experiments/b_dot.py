@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.environment.orbit import circular_orbit
-from adcs.kalman.error_state import AttitudeState, FilterSettings, sensor_set, tuned_noise
+from adcs.kalman.error_state import AttitudeState, FilterSettings, sensor_set
 from adcs.kalman.initialisation import vector_start
 from adcs.kalman.mekf import initial_state, predict, update_state
+from adcs.kalman.process_noise import tuned_noise
 from adcs.satellite.dynamics import WheelControl, relative_rate
 from adcs.satellite.magnetic_control import BDot, HysteresisRods, b_dot_gain, detumbled
 from adcs.satellite.satellite import Satellite

@@ -19,9 +19,9 @@ from adcs.kalman.error_state import (
     SensorSet,
     sensor_set,
     start_near,
-    tuned_noise,
 )
 from adcs.kalman.mekf import run_filter
+from adcs.kalman.process_noise import tuned_noise
 from adcs.satellite import dynamics
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Record

@@ -44,6 +44,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: FilterStart) ->
     gyro_rad_s = record.satellite.gyro.sigma_rad_s
     runs, n = rates.shape[:2]
     walk = np.square([settings.noise.attitude, settings.noise.gyro_bias_rad_s]) / record.dt_s
+    walk[1] += record.satellite.gyro.bias_walk_rad_s**2
     others = replace(settings, sensors=replace(used, gyro=False, states=()))
     P = np.zeros((runs, 6, 6))
     P[:, :3, :3], P[:, 3:, 3:] = start.covariance[:, :3, :3], settings.gyro_bias_sigma_rad_s**2 * np.eye(3)

@@ -11,7 +11,8 @@ import pytest
 
 from adcs.environment.orbit import CircularOrbit, Sgp4Orbit
 from adcs.io.scenario_files import built_in_scenarios, read_scenario, scenario_text
-from adcs.kalman.error_state import ProcessNoise, paper_noise, tuned_noise
+from adcs.kalman.error_state import ProcessNoise
+from adcs.kalman.process_noise import paper_noise, tuned_noise
 from arrays.io.errors import InputError
 from sims.attitude.files import simulation_of
 from tests.adcs.filter_runs import tabletsat

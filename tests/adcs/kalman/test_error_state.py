@@ -6,7 +6,8 @@ from itertools import permutations
 
 import pytest
 
-from adcs.kalman.error_state import PAPER_NOISE, ProcessNoise, paper_noise, sensor_set, tuned_noise
+from adcs.kalman.error_state import ProcessNoise, sensor_set
+from adcs.kalman.process_noise import PAPER_NOISE, paper_noise, tuned_noise
 
 TABLE_3 = [
     ("st+gyro+mag+sun", ()),

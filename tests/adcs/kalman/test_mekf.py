@@ -27,7 +27,6 @@ from adcs.kalman.error_state import (
     FilterSettings,
     FilterStart,
     ProcessNoise,
-    paper_noise,
     sensor_set,
 )
 from adcs.kalman.mekf import (
@@ -43,6 +42,7 @@ from adcs.kalman.mekf import (
     run_filter,
     update_state,
 )
+from adcs.kalman.process_noise import paper_noise
 from adcs.kalman.smoother import error_between
 from adcs.satellite.sensors import StarTracker
 from magloc import core
