@@ -14,7 +14,7 @@ NOT_INSTALLED = { echo "magloc could not be installed: it needs the package inde
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
 .PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against validation docs notebooks pictures chromium lint sanitize clean
-.PHONY: ready compiled-tests
+.PHONY: ready compiled-tests types style style-of-kernels
 
 map: .venv/installed
 	$(BIN)/magloc map
@@ -26,18 +26,24 @@ test: ready chromium
 test-full: ready chromium
 	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 3
 
-lint: .venv/installed-test
+lint: types style style-of-kernels
+
+types: .venv/installed-test
+	$(BIN)/mypy
+
+style: .venv/installed-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/clang-format --dry-run -Werror $$(find magloc adcs docs/examples -name '*.cpp' -o -name '*.hpp' -o -name '*.[ch]')
-	$(BIN)/clang-tidy --quiet magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
-	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/codespell README.md CONTRIBUTING.md CHANGELOG.md arrays magloc adcs sims docs
 
-# Tests are compiled once, beside the linters.
+style-of-kernels: .venv/installed-test
+	$(BIN)/clang-format --dry-run -Werror $$(find magloc adcs docs/examples -name '*.cpp' -o -name '*.hpp' -o -name '*.[ch]')
+	$(BIN)/clang-tidy --quiet magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
+
+# Tests are compiled once, beside the linters, of which mypy takes as long as all others.
 ready: .venv/installed-test
-	@$(MAKE) --no-print-directory --jobs=2 lint compiled-tests
+	@$(MAKE) --no-print-directory --jobs=2 types style style-of-kernels compiled-tests
 
 compiled-tests: .venv/installed-test
 	@$(BIN)/python -m pytest -qq --collect-only >/dev/null

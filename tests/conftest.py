@@ -120,6 +120,23 @@ def instruction_set(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.fixture
+def instruction_sets() -> Iterator[Iterator[str]]:
+    """Use each of the machine's instruction sets in turn, where a test compares all with one result that takes long."""
+    before = core.instruction_set()
+
+    def usable() -> Iterator[str]:
+        for name in ("baseline", "avx2", "avx512"):
+            try:
+                core.use_instruction_set(name)
+            except ValueError:
+                continue
+            yield name
+
+    yield usable()
+    core.use_instruction_set(before)
+
+
+@pytest.fixture
 def threads() -> Iterator[Callable[[int], None]]:
     """Set the number of threads of compiled kernels, for one test."""
     before = core.threads()

@@ -35,7 +35,9 @@ WIDEST = 88
 # Pages, and packages with examples, whose code takes many seconds.
 SLOW = {
     "array-design",
+    "drone-log",
     "exporting",
+    "field-log",
     "live",
     "magloc.plots",
     "monte-carlo",

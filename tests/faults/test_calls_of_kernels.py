@@ -59,7 +59,7 @@ run(lambda frame, event, _: called.setdefault(frame.f_code) if event == "call" e
 called = {}
 run(lambda frame, event, _: called.setdefault(frame.f_code) if event == "call" else None)  # loaded
 ours = lambda code: "magloc" in code.co_filename
-for code in sorted(called, key=ours):
+for code in sorted(called, key=ours)[::EVERY]:
     sent = []
     def interrupt(frame, event, _):
         if event == "call" and frame.f_code is code:
@@ -100,5 +100,7 @@ def test_two_threads_without_openmp() -> None:
     assert status_of(MAP + THREADS) == 0
 
 
-def test_an_interruption_stays_one() -> None:
-    assert status_of(INTERRUPTED) == 0
+@pytest.mark.parametrize("every", [5, pytest.param(1, marks=pytest.mark.slow)])
+def test_an_interruption_stays_one(every: int) -> None:
+    """At the first call of each function, or of each fifth one."""
+    assert status_of(INTERRUPTED.replace("EVERY", str(every))) == 0

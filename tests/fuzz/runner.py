@@ -114,7 +114,7 @@ def _asks_for_much(words: Sequence[str]) -> Iterator[bool]:
     """Whether a whole number is long work, which is no hang, rather than too much, which is refused."""
     for option, word in pairwise(words):
         value = word.replace("_", "")  # 1_000 is a number too
-        most = 3000 if option == "--duration" else 100
+        most = {"--duration": 3000, "--seeds": 4}.get(option, 100)
         yield option.startswith("--") and value.isascii() and value.isdigit() and most < float(value) < 1e7
 
 

@@ -209,7 +209,7 @@ class TestCompiledTwin:
     @pytest.mark.parametrize(("sensors", "states"), [*TABLE_3, ALL, EVERYTHING])
     def test_agrees(self, sensors: str, states: tuple[str, ...]) -> None:
         chosen = settings(sensors, states)
-        runs, start = runs_for(chosen.sensors, 60.0, range(3))
+        runs, start = runs_for(chosen.sensors, 40.0, range(2))
         # Gaps of every sensor.
         for i, name in enumerate(("star", "gyro_rad_s", "field_T", "sun")):
             getattr(runs.readings, name)[:, 10 + i : 40 : 7] = np.nan

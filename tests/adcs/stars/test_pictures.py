@@ -403,18 +403,20 @@ class TestWideFields:
 
 
 class TestCommand:
-    @pytest.fixture
-    def files(self, tmp_path):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def files(cls, tmp_path_factory):
         """A photograph and its catalogue."""
+        folder = tmp_path_factory.mktemp("sky")
         R = Rotation.random(random_state=8).as_matrix()
         picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(9))
-        Image.fromarray(picture.astype(np.uint16)).save(tmp_path / "sky.png")
+        Image.fromarray(picture.astype(np.uint16)).save(folder / "sky.png")
         ra = np.degrees(np.arctan2(SKY.directions[:, 1], SKY.directions[:, 0])) % 360.0
         columns = SKY.numbers, ra, np.degrees(np.arcsin(SKY.directions[:, 2])), SKY.magnitudes
         np.savetxt(
-            tmp_path / "sky.csv", np.column_stack(columns), "%.9g", ",", header="hip,ra_deg,dec_deg,mag", comments=""
+            folder / "sky.csv", np.column_stack(columns), "%.9g", ",", header="hip,ra_deg,dec_deg,mag", comments=""
         )
-        return tmp_path
+        return folder
 
     def test_words(self, files, capsys):
         arguments = [str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), "--scale-arcsec", "61"]

@@ -301,8 +301,10 @@ class TestSignsOfLife:
         assert self.told(monkeypatch, watched=True, bar=True) == []
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-@pytest.mark.parametrize("program", ["magloc", "adcs"])
+@pytest.mark.slow_after(2)
+@pytest.mark.parametrize(
+    ("program", "shell"), [("magloc", "bash"), ("adcs", "zsh"), ("magloc", "zsh"), ("adcs", "bash")]
+)
 def test_completion_of_commands_and_options(
     program: str, shell: str, request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -87,13 +87,13 @@ def coefficients_are_honest(seeds: range) -> None:
         assert min(low, 0.7) < np.mean(each) < max(high, 1.3)
 
 
-def test_coefficients_of_three_flights() -> None:
-    coefficients_are_honest(range(3))
+def test_coefficients_of_a_flight() -> None:
+    coefficients_are_honest(range(1))
 
 
 @pytest.mark.slow
-def test_coefficients_of_fifty_flights() -> None:
-    coefficients_are_honest(range(3, 53))
+def test_coefficients_of_many_flights() -> None:
+    coefficients_are_honest(range(1, 53))
 
 
 class TestResult:
@@ -146,6 +146,7 @@ class TestCalibration:
         found = magloc.compensate(ARRAY, rows, calibration=calm().readings)
         truth = np.linalg.norm(other.ambient(), axis=1)
         assert errors_T(found, truth).std() < 2.0 * NOISE_T
+        assert not flagged(found, "mismatch")
 
     def test_currents_count_from_the_mean_of_the_calibration(self) -> None:
         flown = fly(101)
@@ -172,7 +173,6 @@ class TestCalibration:
         values[:, :1] = truth + 0.5 * (values[:, :1] - truth)
         found = magloc.compensate(ARRAY, changed(values), calibration=rows)
         assert any(flag.startswith("mismatch: fast changes of mag in the log are 0.5 ") for flag in found.flags)
-        assert not flagged(magloc.compensate(ARRAY, rows, calibration=rows), "mismatch")
 
     def test_attitude_of_the_pose(self) -> None:
         """A scalar sensor alone, with the pose and the ambient field of a model: as good as with the vector sensor."""

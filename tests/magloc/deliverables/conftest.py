@@ -23,7 +23,7 @@ def survey() -> magloc.Survey:
     return magloc.survey(field.array, field.readings)
 
 
-@pytest.fixture(params=["EPSG:32633", "EPSG:4326"])
+@pytest.fixture(scope="session", params=["EPSG:32633", "EPSG:4326"])
 def frame(request: pytest.FixtureRequest) -> MapFrame:
     """A map in UTM or in longitudes and latitudes."""
     return MapFrame(ORIGIN, request.param)

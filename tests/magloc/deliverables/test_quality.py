@@ -75,6 +75,7 @@ class TestSoundLog:
 
 
 class TestNoise:
+    @pytest.mark.usefixtures("without_lag")
     def test_more_than_stated(self) -> None:
         rng = np.random.default_rng(3)
         quality = checked(lambda values: values + rng.normal(size=values.shape, scale=[0.0, 5e-10]))
@@ -91,6 +92,7 @@ class TestNoise:
 
 
 class TestHeadingError:
+    @pytest.mark.usefixtures("without_lag")
     @pytest.mark.parametrize("size_nT", [0.0, 10.0])
     def test_opposite_courses(self, size_nT: float) -> None:
         quality = checked(lambda values: values + 1e-9 * size_nT * AHEAD[:, None] * [1.0, 0.0])
@@ -103,6 +105,7 @@ class TestHeadingError:
         quality = checked(lambda values: values + 1e-9 * ROWS.time_s[:, None] / 60.0)
         assert "heading error" not in quality.flags
 
+    @pytest.mark.usefixtures("without_lag")
     def test_one_course(self) -> None:
         rows = ROWS[np.flatnonzero(AHEAD > 0.0)]
         assert magloc.check_quality(PAIR, rows).heading == [None, None]
@@ -147,6 +150,7 @@ class TestGaps:
         quality = magloc.check_quality(PAIR, replace(ROWS, time_s=stamps))
         assert value(quality, "jitter") == pytest.approx(5.0 * np.sqrt(2.0), rel=0.1)
 
+    @pytest.mark.usefixtures("without_lag")
     def test_places_of_a_slow_receiver(self) -> None:
         assert ROWS.array_position_m is not None
         held = np.arange(len(ROWS)) // 3 * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -111,15 +112,21 @@ def readable_rows(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 class TestCompiledRecord:
     """The compiled steps and the readable ones: the same points to 1e-9, and the same steps."""
 
-    def both(self, array: SensorArray, motion: MotionModel, rows: list[Row]) -> list[TrackPoint]:
-        readable, compiled = (kind(array, motion, keep_steps=True) for kind in (ReadableTracker, Tracker))
-        expected, points = followed(readable, rows), followed(compiled, rows)
-        assert_same_points(points, expected)
-        assert [step.row for step in compiled.steps] == [step.row for step in readable.steps]
-        assert innovation_test(points).flagged == innovation_test(expected).flagged
-        for a, b in zip(smooth_points(points, compiled.steps), smooth_points(expected, readable.steps), strict=True):
-            if a.position_m is not None and b.position_m is not None:
-                np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
+    def both(
+        self, array: SensorArray, motion: MotionModel, rows: list[Row], sets: Iterable[str] = ("best",)
+    ) -> list[TrackPoint]:
+        readable = ReadableTracker(array, motion, keep_steps=True)
+        expected = followed(readable, rows)
+        smoothed = smooth_points(expected, readable.steps)
+        for _ in sets:
+            compiled = Tracker(array, motion, keep_steps=True)
+            points = followed(compiled, rows)
+            assert_same_points(points, expected)
+            assert [step.row for step in compiled.steps] == [step.row for step in readable.steps]
+            assert innovation_test(points).flagged == innovation_test(expected).flagged
+            for a, b in zip(smooth_points(points, compiled.steps), smoothed, strict=True):
+                if a.position_m is not None and b.position_m is not None:
+                    np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
         return points
 
     def test_rows_that_come_piece_by_piece(self) -> None:
@@ -163,8 +170,7 @@ class TestCompiledRecord:
         with pytest.raises(ValueError, match="must increase"):
             followed(tracker, rows[-1:])
 
-    @all_instruction_sets
-    def test_gaps_missing_channels_and_spikes(self) -> None:
+    def test_gaps_missing_channels_and_spikes(self, instruction_sets: Iterator[str]) -> None:
         n = 120
         rng = np.random.default_rng(8)
         time_s, p, m = moving_source(n)
@@ -174,12 +180,11 @@ class TestCompiledRecord:
         readings[rng.random(readings.shape) < 0.05] = np.nan
         readings[30:36] = np.nan
         readings[[20, 50, 51], [3, 7, 1]] += 1e-6
-        points = self.both(ARRAY, SLOW, rows_from(time_s, readings))
+        points = self.both(ARRAY, SLOW, rows_from(time_s, readings), instruction_sets)
         assert {"acquired", "tracked", "predicted", "outlier"} <= set(statuses(points))
         assert statuses(points).count("acquired") >= 2
 
-    @all_instruction_sets
-    def test_scalar_sensors_in_an_ambient_field_of_every_row(self) -> None:
+    def test_scalar_sensors_in_an_ambient_field_of_every_row(self, instruction_sets: Iterator[str]) -> None:
         n = 60
         array = geometries.cube(1.5, "scalar", NOISE_T)
         time_s, p, m = moving_source(n)
@@ -188,12 +193,11 @@ class TestCompiledRecord:
         fields = np.stack([magpylib_field(array.positions, *source) for source in zip(p, m, strict=True)])
         readings = np.linalg.norm(fields + ambient[:, None], axis=-1) + noise
         rows = list(rows_of(Readings(readings, time_s=time_s, ambient_T=ambient)))
-        points = self.both(array, SLOW, rows)
+        points = self.both(array, SLOW, rows, instruction_sets)
         assert statuses(points).count("tracked") > 50
         assert np.nanmax(np.linalg.norm(positions(points) - p, axis=1)) < 0.3
 
-    @all_instruction_sets
-    def test_a_moving_array(self) -> None:
+    def test_a_moving_array(self, instruction_sets: Iterator[str]) -> None:
         n = 60
         time_s, p, m = moving_source(n)
         origin = np.outer(time_s, [-0.05, 0.05, 0.0]) + np.array([10.0, -4.0, 2.0])
@@ -202,33 +206,32 @@ class TestCompiledRecord:
         in_array = rotation.inv().apply(world_p - origin)
         readings = readings_of(ARRAY, in_array, rotation.inv().apply(m))
         rows = list(rows_of(Readings(readings, time_s=time_s, array_position_m=origin, array_rotation=rotation)))
-        points = self.both(ARRAY, SLOW, rows)
+        points = self.both(ARRAY, SLOW, rows, instruction_sets)
         assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
         assert np.linalg.norm(positions(points) - world_p, axis=1).max() < 0.2
 
-    @all_instruction_sets
-    def test_noise_that_depends_on_the_reading(self) -> None:
+    def test_noise_that_depends_on_the_reading(self, instruction_sets: Iterator[str]) -> None:
         time_s, p, m = moving_source(40)
         array = replace(ARRAY, noise_fraction=1e-3)
-        points = self.both(array, SLOW, rows_from(time_s, readings_of(array, p, m)))
+        points = self.both(array, SLOW, rows_from(time_s, readings_of(array, p, m)), instruction_sets)
         assert statuses(points).count("tracked") > 30
 
-    @all_instruction_sets
     @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("seed", range(3))
-    def test_a_source_at_rest_that_is_known_along_a_curve(self, seed: int) -> None:
+    def test_a_source_at_rest_that_is_known_along_a_curve(self, seed: int, instruction_sets: Iterator[str]) -> None:
         """The paper's scenario, where a prior that bends changes the track by several σ: see test_row_measurement."""
         readings = sims.simulate(sims.read_scenario("paper"), seed).readings
         array = geometries.tetrahedron(1.5, "vector", 1e-9)
-        points = self.both(array, RandomWalk(1e-6, 1e-6), rows_from(readings.time_s, readings.values_T))
+        points = self.both(
+            array, RandomWalk(1e-6, 1e-6), rows_from(readings.time_s, readings.values_T), instruction_sets
+        )
         assert statuses(points).count("tracked") >= 50
 
-    @all_instruction_sets
-    def test_a_velocity(self) -> None:
+    def test_a_velocity(self, instruction_sets: Iterator[str]) -> None:
         time_s, p, m = moving_source(50)
         readings = readings_of(ARRAY, p, m)
         readings[25:28] = np.nan
-        points = self.both(ARRAY, WanderingVelocity(), rows_from(time_s, readings))
+        points = self.both(ARRAY, WanderingVelocity(), rows_from(time_s, readings), instruction_sets)
         assert statuses(points) == ["acquired", *["tracked"] * 24, *["predicted"] * 3, *["tracked"] * 22]
 
     def test_blocks_of_rows_do_not_matter(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -243,18 +246,16 @@ class TestCompiledRecord:
         assert [point.nis for point in points] == [point.nis for point in expected]
         np.testing.assert_array_equal(positions(points), positions(expected))
 
-    @all_instruction_sets
-    def test_rows_that_have_no_coordinates_of_their_own(self) -> None:
+    def test_rows_that_have_no_coordinates_of_their_own(self, instruction_sets: Iterator[str]) -> None:
         """Five differences: the prediction is taken as Gaussian in position and moment there."""
         time_s, p, m = moving_source(40)
         readings = readings_of(ARRAY, p, m)
         readings[10:30:2, 3:7] = np.nan
-        points = self.both(ARRAY, SLOW, rows_from(time_s, readings))
+        points = self.both(ARRAY, SLOW, rows_from(time_s, readings), instruction_sets)
         assert [point.nis_dof for point in points[10:14]] == [5, 9, 5, 9]
         assert set(statuses(points[1:])) == {"tracked"}
 
-    @all_instruction_sets
-    def test_steps_that_swing(self) -> None:
+    def test_steps_that_swing(self, instruction_sets: Iterator[str]) -> None:
         """A source that is weak and far: the iterations that shrink do so in both, and their number is the same."""
         array = geometries.tetrahedron(1.5, "vector", 1e-9)
         rng = np.random.default_rng(9)
@@ -262,9 +263,11 @@ class TestCompiledRecord:
         p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
         rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
         motion = RandomWalk(0.1, 0.05)
-        readable, compiled = (followed(kind(array, motion), rows) for kind in (ReadableTracker, Tracker))
-        assert_same_points(compiled, readable)
-        assert [point.iterations for point in compiled] == [point.iterations for point in readable]
+        readable = followed(ReadableTracker(array, motion), rows)
+        for _ in instruction_sets:
+            compiled = followed(Tracker(array, motion), rows)
+            assert_same_points(compiled, readable)
+            assert [point.iterations for point in compiled] == [point.iterations for point in readable]
         assert max(point.iterations for point in readable) > 5
 
     def test_sensors_with_other_lasting_errors_take_the_readable_steps(self) -> None:
@@ -290,10 +293,11 @@ class TestCompiledRecord:
         assert_same_points(points, expected)
         assert len(readable_rows) < 60
 
-    @all_instruction_sets
-    def test_a_lasting_rate_of_turn(self) -> None:
+    def test_a_lasting_rate_of_turn(self, instruction_sets: Iterator[str]) -> None:
         time_s, p, m = moving_source(60)
-        points = self.both(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        points = self.both(
+            ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)), instruction_sets
+        )
         assert statuses(points).count("tracked") == 59
 
     def test_other_motions_take_the_readable_path(self) -> None:

@@ -79,6 +79,7 @@ class TestTerrain:
         assert done.status == 0, done.err
         assert_depths(json.loads(done.out)["targets"])
 
+    @pytest.mark.usefixtures("without_pdf", "without_lag")
     def test_heights_above_ground_in_the_log(self, folder: Path, tmp_path: Path, run: Run) -> None:
         """Heights of the map are those of the terrain: targets lie 0.3 to 1.5 m below the hills at 33 m."""
         raw = pytest.importorskip("pyogrio.raw")
@@ -94,6 +95,7 @@ class TestTerrain:
         assert "dem.tif, at heights of 32." in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
         np.testing.assert_allclose(flown, CLEARANCE_M + 0.5, atol=0.05)  # the middle of both sensors
 
+    @pytest.mark.usefixtures("without_lag")
     def test_an_altimeter(self, folder: Path, run: Run) -> None:
         done = run("survey", folder / "walk.csv", "--array", folder / "sea.toml", "--terrain", "Above", "--json")
         assert done.status == 0, done.err

@@ -30,14 +30,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestQc:
-    def test_table(self, folder: Path, run: Run) -> None:
-        done = run("qc", folder / "walk.csv", "--array", folder / "pair.toml")
+    @pytest.mark.usefixtures("without_lag")
+    def test_table_and_files(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        done = run("qc", folder / "walk.csv", "--array", folder / "pair.toml", "--out", tmp_path / "out")
         assert done.status == 0, done.err
         assert "the carrier moved on, at" in done.out
         assert "times the stated noise" in done.out
+        with (tmp_path / "out" / "qc.csv").open(encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        assert [float(row["value"]) for row in rows if row["check"] == "rows"] == [len(ROWS) - 25]
+        assert (tmp_path / "out" / "qc.png").read_bytes().startswith(b"\x89PNG")
 
-    def test_json(self, folder: Path, run: Run) -> None:
-        done = run("qc", folder / "walk.csv", "--array", folder / "pair.toml", "--json")
+    def test_json_and_the_height_of_the_ground(self, folder: Path, run: Run) -> None:
+        done = run("qc", folder / "walk.csv", "--array", folder / "pair.toml", "--ground-m", "-2", "--json")
         assert done.status == 0, done.err
         found = json.loads(done.out)
         assert {"way in a gap", "noise"} <= set(found["flags"])
@@ -45,29 +50,7 @@ class TestQc:
         assert set(found["lines"][0]) == {"name", "rows", "speed_m_s", "height_m"}
         longest = max(found["gaps"], key=lambda gap: gap["way_m"])
         assert longest["start_s"] == pytest.approx(ROWS.time_s[159])
-
-    def test_files(self, folder: Path, tmp_path: Path, run: Run) -> None:
-        done = run("qc", folder / "walk.csv", "--array", folder / "pair.toml", "--out", tmp_path / "out")
-        assert done.status == 0, done.err
-        with (tmp_path / "out" / "qc.csv").open(encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        assert [float(row["value"]) for row in rows if row["check"] == "rows"] == [len(ROWS) - 25]
-        assert (tmp_path / "out" / "qc.png").read_bytes().startswith(b"\x89PNG")
-
-    def test_the_height_of_the_ground(self, folder: Path, run: Run) -> None:
-        line = (
-            "qc",
-            folder / "walk.csv",
-            "--array",
-            folder / "pair.toml",
-            "--ground-m",
-            "-2",
-            "--json",
-        )
-        done = run(*line)
-        assert done.status == 0, done.err
-        checks = {check["name"]: check["value"] for check in json.loads(done.out)["checks"]}
-        assert checks["height"] == pytest.approx(3.2, abs=0.02)
+        assert {check["name"]: check["value"] for check in found["checks"]}["height"] == pytest.approx(3.2, abs=0.02)
 
     def test_bad_input(self, folder: Path, tmp_path: Path, run: Run) -> None:
         rows = "time_s,low_nT,high_nT\n" + "\n".join(f"{t},48000,48001" for t in range(30)) + "\n"

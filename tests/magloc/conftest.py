@@ -1,0 +1,23 @@
+"""Work of surveys that most tests spare: each has tests that do it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from magloc.surveying.clock import ClockLag
+
+
+@pytest.fixture
+def without_pdf(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start no browser to print the report."""
+    monkeypatch.setattr("magloc.deliverables.files._print_report", lambda path: None)
+
+
+@pytest.fixture
+def without_lag(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimate no lag of the clock, which takes most of the time of a short survey."""
+    monkeypatch.setattr(
+        "magloc.surveying.tiled.TiledSurvey.correct_lag", lambda tiled, _: (tiled, ClockLag(0.0, math.inf))
+    )
