@@ -33,6 +33,7 @@ _HALF_WINDOW = 3
 _WEIGHT_PX, _ROUNDS = 1.2, 6  # width of the weight of centroids, and number of iterations
 _SIGMA_OF_MAD = 1.4826
 _MOST_PIXELS = 10**8
+_MOST_MISSING = 0.5  # largest share of pixels without a value
 _FITS_BLOCK, _FITS_CARD = 2880, 80
 _FITS_TYPES = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
 
@@ -118,13 +119,32 @@ def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
         kind = np.dtype(_FITS_TYPES[int(header["BITPIX"])])
         width, height = int(header["NAXIS1"]), int(header["NAXIS2"])
         values = np.frombuffer(data, kind, width * height, start).reshape(height, width)
-        with np.errstate(invalid="ignore", over="ignore"):  # _check_picture refuses numbers that are not finite
+        with np.errstate(invalid="ignore", over="ignore"):
             scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
+        if kind.kind != "f" and "BLANK" in header:
+            scaled[values == int(header["BLANK"])] = np.nan
     except (KeyError, OverflowError, ValueError):
         raise InputError(
             f"{path}: found no image in two dimensions, expected one as the first of a FITS file."
         ) from None
-    return _check_picture(path, scaled[::-1])
+    return _check_picture(path, _filled(scaled[::-1]))
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Return a picture whose missing pixels are the median of their blocks, if fewer than half are missing.
+
+    A picture with more missing pixels is returned as it is.
+    """
+    missing = ~np.isfinite(values)
+    if not missing.any() or missing.mean() > _MOST_MISSING or min(values.shape) < LEAST_PX:
+        return values
+    everywhere = float(np.median(values[~missing]))
+
+    def median(block: FloatArray) -> float:
+        known = block[np.isfinite(block)]
+        return float(np.median(known)) if known.size else everywhere
+
+    return np.where(missing, _neighbourhood_statistic(values, median), values)
 
 
 def _check_picture(path: str | PathLike[str], values: np.ndarray) -> FloatArray:

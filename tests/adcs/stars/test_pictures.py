@@ -75,6 +75,37 @@ class TestFiles:
                     r"found (no picture that can be read|a picture of shape|too many|\d+ × \d+).*", said
                 )
 
+    def test_missing_pixels(self, tmp_path):
+        """NaN, infinity and the integer of BLANK: others stay as they are, and the missing ones look like the sky."""
+        values = 100.0 + np.random.default_rng(0).integers(0, 9, (130, 150)).astype(np.float64)
+        missing = np.zeros(values.shape, dtype=bool)
+        missing[:40], missing[60:70, 20:30] = True, True
+        holed = np.where(missing, np.nan, values)
+        holed[0, 0] = np.inf
+        (tmp_path / "float.fits").write_bytes(fits_bytes(holed[::-1], -32))
+        whole = fits_bytes(np.where(missing, -7.0, values)[::-1], 16)
+        (tmp_path / "integer.fits").write_bytes(
+            whole.replace(b"END" + b" " * 77, b"BLANK   =                   -7".ljust(80) + b"END" + b" " * 77)[:2880]
+            + whole[2880:]
+        )
+        for name in ("float", "integer"):
+            read = read_picture(tmp_path / f"{name}.fits")
+            np.testing.assert_array_equal(read[~missing], values[~missing])
+            assert ((read[missing] >= 100.0) & (read[missing] <= 108.0)).all()
+        (tmp_path / "most.fits").write_bytes(fits_bytes(np.where(np.arange(150) < 80, np.nan, values), -32))
+        with pytest.raises(InputError, match="finite pixels"):
+            read_picture(tmp_path / "most.fits")
+
+    def test_a_masked_photograph_is_solved(self, tmp_path):
+        """A third of the picture is masked; the attitude stays within a fifth of a pixel of the true one."""
+        R = Rotation.random(random_state=8).as_matrix()
+        picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(9))
+        picture[:120], picture[:, 500:] = np.nan, np.nan
+        (tmp_path / "masked.fits").write_bytes(fits_bytes(picture[::-1], -32))
+        _, found = solve_photograph(read_picture(tmp_path / "masked.fits"), SKY)
+        off = np.linalg.norm(found.R_catalogue_from_frame[:, 2] - R[:, 2])
+        assert off < 0.2 * CAMERA.rad_per_px
+
     def test_refusals(self, tmp_path):
         (tmp_path / "no.png").write_bytes(b"no picture")
         Image.fromarray(np.zeros((20, 90), np.uint8)).save(tmp_path / "small.png")
