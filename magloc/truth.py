@@ -6,6 +6,7 @@ moment of unknown strength ``axis_x, axis_y, axis_z`` stand in place of the mome
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -34,6 +35,10 @@ SAME_TIME_S = 1e-6
 _LONGEST_STEP = 2.0
 # Rounding of a unit vector in a file.
 _UNIT_WITHIN = 1e-2
+# Fewest rows that tell a wrong frame from errors; largest share of the error that a cause may leave; least error over
+# the extent of the path that needs a cause; largest lag of a clock over the duration; share of rows that are fitted.
+_FEWEST, _EXPLAINED, _LARGE, _LONGEST_LAG, _TRIMMED = 12, 0.2, 0.05, 0.5, 0.8
+_LENGTHS = {1e3: "millimetres", 1e2: "centimetres", 1e-3: "kilometres", 1.0 / 0.3048: "feet"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +164,10 @@ def truth_of_rows(readings: Readings, truth: Truth) -> Truth:
     longest = _LONGEST_STEP * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     known = exact | ((times[before] <= wanted) & (wanted <= times[after]) & (length <= longest))
     if not known.any():
-        raise InputError(f"{truth.name}: found none of the times of the readings, expected rows with the same time_s.")
+        raise InputError(
+            f"{truth.name}: found none of the times of the readings: {times[0]:.15g} s to {times[-1]:.15g} s, expected "
+            f"rows within {wanted.min():.15g} s to {wanted.max():.15g} s, by the same clock."
+        )
     share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)
 
     def of_rows(values: FloatArray | None) -> Any:
@@ -170,6 +178,83 @@ def truth_of_rows(readings: Readings, truth: Truth) -> Truth:
 
     position_m, moment_Am2, sigma_m = map(of_rows, (truth.position_m, truth.moment_Am2, truth.sigma_m))
     return Truth(wanted, position_m, moment_Am2, truth.name, sigma_m=sigma_m)
+
+
+def cause_of_disagreement(truth: Truth, time_s: FloatArray, position_m: FloatArray) -> str:
+    """Return a sentence on the clock or the frame of a truth that does not fit the positions (n, 3) found; else "".
+
+    The error must be a twentieth of the path's extent, and one cause must explain four fifths of it.
+    """
+    order = np.argsort(truth.time_s, kind="stable")
+    times, path = truth.time_s[order], truth.position_m[order]
+    known = np.isfinite(position_m).all(axis=1) & (time_s >= times[0]) & (time_s <= times[-1])
+    found, wanted = position_m[known], time_s[known]
+    if len(found) < _FEWEST or not np.isfinite(path).all():
+        return ""
+
+    def of_times(at_s: FloatArray) -> FloatArray:
+        return np.stack([np.interp(at_s, times, axis) for axis in path.T], axis=1)
+
+    true = of_times(wanted)
+    plain = float(np.median(np.linalg.norm(found - true, axis=1)))
+    extent = float(np.linalg.norm(np.std(true, axis=0)))
+    if plain < _LARGE * extent:
+        return ""
+    causes = [_by_length(found, true), _by_clock(found, wanted, times, of_times), *_by_frame(found, true)]
+    left = min(error for error, _ in causes)
+    if left > _EXPLAINED * plain:
+        return ""
+    # Of causes that explain nearly as much the first, which is the simplest.
+    error, cause = next(each for each in causes if each[0] <= 1.5 * left)
+    return (
+        f"{truth.name}: found positions {plain:.3g} m from the results in the median, {error:.3g} m after {cause}; "
+        "expected the frame and the clock of the readings."
+    )
+
+
+def _by_length(found: FloatArray, true: FloatArray) -> tuple[float, str]:
+    """Return the error that is left by the best unit of length, and its sentence."""
+    errors = {factor: float(np.median(np.linalg.norm(found - true / factor, axis=1))) for factor in _LENGTHS}
+    factor = min(errors, key=lambda each: errors[each])
+    return errors[factor], f"they are taken for {_LENGTHS[factor]}: state them in metres"
+
+
+def _by_clock(
+    found: FloatArray, wanted_s: FloatArray, times_s: FloatArray, path: Callable[[FloatArray], FloatArray]
+) -> tuple[float, str]:
+    """Return the error that is left by the best lag of the clock, and its sentence."""
+    longest = _LONGEST_LAG * (times_s[-1] - times_s[0])
+
+    def error(lag_s: float) -> float:
+        at_s = wanted_s + lag_s
+        inside = (at_s >= times_s[0]) & (at_s <= times_s[-1])
+        return float(np.median(np.linalg.norm(found - path(at_s), axis=1)[inside])) if inside.any() else np.inf
+
+    lags = np.linspace(-longest, longest, 401)
+    best = lags[int(np.argmin([error(lag) for lag in lags]))]
+    fine = best + np.linspace(-1.0, 1.0, 101) * (lags[1] - lags[0])
+    lag_s = float(fine[int(np.argmin([error(lag) for lag in fine]))])
+    return error(lag_s), f"{lag_s:.3g} s is subtracted from its time_s: its clock is another"
+
+
+def _by_frame(found: FloatArray, true: FloatArray) -> Iterator[tuple[float, str]]:
+    """Yield the errors that are left by a shift, a turn and a mirror image, each with its sentence."""
+    shift = np.median(found - true, axis=0)
+    moved = float(np.median(np.linalg.norm(found - true - shift, axis=1)))
+    yield moved, f"they are shifted by ({shift[0]:.3g}, {shift[1]:.3g}, {shift[2]:.3g}) m: its origin is another"
+    for handed, what in (
+        (1.0, "turned by"),
+        (-1.0, "mirrored (an axis has the wrong sign, or two are exchanged) and turned by"),
+    ):
+        kept = np.ones(len(found), dtype=bool)
+        for _ in range(4):
+            a, b = found[kept].mean(axis=0), true[kept].mean(axis=0)
+            U, _, Vt = np.linalg.svd((found[kept] - a).T @ (true[kept] - b))
+            R = U @ np.diag([1.0, 1.0, handed * np.linalg.det(U @ Vt)]) @ Vt
+            left = np.linalg.norm(found - a - (true - b) @ R.T, axis=1)
+            kept = left <= np.quantile(left, _TRIMMED)
+        angle_deg = float(np.degrees(np.arccos(np.clip(0.5 * (np.trace(handed * R) - 1.0), -1.0, 1.0))))
+        yield float(np.median(left)), f"they are {what} {angle_deg:.0f}° and shifted: its frame is another"
 
 
 def state_columns(position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> dict[str, Column]:

@@ -14,7 +14,7 @@ import magloc
 from arrays.io.errors import LARGEST, InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, progress, refuse_outside
+from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, progress, refuse_outside, warn
 from magloc.cli.options import KnownOptions, ambient_field, number_of_sources
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def locate(
     from magloc.localization.files import entries_of_fixes
     from magloc.localization.fit.table import legend, lines_of_fixes
     from magloc.localization.locator import used_rows
-    from magloc.truth import truth_of_rows
+    from magloc.truth import cause_of_disagreement, truth_of_rows
 
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
     length_m, position = wanted.body_length_m, wanted.position
@@ -128,7 +128,8 @@ def locate(
     used, ambient_T = ambient_field(used, rows, where, gradient=wanted.ambient_gradient)
     try:
         pictured, noisy, _ = used_rows(rows, used, average=wanted.average)
-        true = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))
+        stated = None if truth is None else magloc.read_truth(truth)
+        true = None if stated is None else truth_of_rows(pictured, stated)
         with progress(len(rows), "rows") as advance:
             fixes = magloc.locate(
                 used,
@@ -160,6 +161,8 @@ def locate(
     n_solved = int(fixes.solved.sum())
     if not n_solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
+    if stated is not None and n_sources == 1 and position is None:
+        warn(filter(None, [cause_of_disagreement(stated, fixes.time_s, fixes.position_m)]))
     if out is not None:
         from magloc.plots.localization import write_fix_figures
 

@@ -13,7 +13,7 @@ import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two, write_files
 from arrays.typing import Vector
-from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, print_report, progress
+from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, print_report, progress, warn
 from magloc.cli.moments.known_path import (
     PathErrorOptions,
     TrackOutputs,
@@ -275,11 +275,15 @@ def _write_track(found: Track, name: str, known: KnownOptions, outputs: TrackOut
     from magloc.localization.fit.table import legend
     from magloc.tracking.files import json_of_track
     from magloc.tracking.sensor_health import OFFSETS
+    from magloc.truth import cause_of_disagreement
 
     json, jsonl = outputs.json, outputs.jsonl
     is_found, result = any(point.is_on_track for point in found), None
     if is_found:
-        result = None if outputs.truth is None else found.consistency(magloc.read_truth(outputs.truth))
+        if outputs.truth is not None:
+            truth = magloc.read_truth(outputs.truth)
+            result = found.consistency(truth)
+            warn(filter(None, [cause_of_disagreement(truth, found.time_s, found.position_m)]))
         outputs.maps.write(found, known.place)
     if is_found and outputs.out is not None:
         from magloc.plots.tracks import write_track_figures

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from arrays.io.errors import InputError
-from magloc.truth import read_truth
+from magloc.truth import Truth, cause_of_disagreement, read_truth
+from tests.command_line import Run
+from tests.conftest import REPOSITORY
 from tests.written import WriteFile, writer
 
 write = writer("truth.csv")
@@ -55,3 +58,67 @@ class TestTruth:
     def test_bad_file(self, write: WriteFile, content: str, fragment: str) -> None:
         with pytest.raises(InputError, match=fragment):
             read_truth(write(content))
+
+
+class TestDisagreement:
+    """Each mistake of a truth file is named; errors of the results alone are not."""
+
+    TIME_S = np.arange(60.0)
+
+    @pytest.fixture
+    def path_m(self) -> np.ndarray:
+        """Path that is not alike from any two sides."""
+        t = self.TIME_S
+        return np.stack([0.02 * t, np.sin(0.17 * t), 0.5 * np.cos(0.11 * t) + 0.3], axis=1)
+
+    def cause(self, stated_m: np.ndarray, path_m: np.ndarray, lag_s: float = 0.0) -> str:
+        found = path_m + 2e-3 * np.random.default_rng(0).normal(size=path_m.shape)
+        return cause_of_disagreement(Truth(self.TIME_S + lag_s, stated_m, name="truth.csv"), self.TIME_S, found)
+
+    def test_errors_alone(self, path_m: np.ndarray) -> None:
+        assert self.cause(path_m, path_m) == ""
+
+    def test_large_errors_without_a_cause(self, path_m: np.ndarray) -> None:
+        other = np.random.default_rng(1).normal(size=path_m.shape)
+        assert self.cause(other, path_m) == ""
+
+    def test_unit(self, path_m: np.ndarray) -> None:
+        assert "taken for millimetres" in self.cause(1e3 * path_m, path_m)
+
+    @pytest.mark.parametrize("lag_s", [-7.3, 4.0])
+    def test_clock(self, path_m: np.ndarray, lag_s: float) -> None:
+        assert f"{lag_s:.3g} s is subtracted from its time_s" in self.cause(path_m, path_m, lag_s)
+
+    def test_origin(self, path_m: np.ndarray) -> None:
+        assert "shifted by (-1" in self.cause(path_m + np.array([1.0, 0.0, 0.0]), path_m)
+
+    def test_turned(self, path_m: np.ndarray) -> None:
+        turned = path_m @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        assert "turned by 90° and shifted" in self.cause(turned, path_m)
+
+    def test_mirrored(self, path_m: np.ndarray) -> None:
+        assert "mirrored" in self.cause(path_m * [1.0, 1.0, -1.0], path_m)
+
+    def test_outliers(self, path_m: np.ndarray) -> None:
+        """A tenth of the fixes at another place does not hide the cause."""
+        found = path_m.copy()
+        found[::10] += 5.0
+        turned = path_m @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        assert "turned by 90°" in cause_of_disagreement(Truth(self.TIME_S, turned), self.TIME_S, found)
+
+    @pytest.mark.parametrize("command", ["locate", "track", "calibrate"])
+    def test_by_the_commands(self, tmp_path: Path, run: Run, command: str) -> None:
+        folder = REPOSITORY / "magloc" / "datasets"
+        lines = (folder / "board-truth.csv").read_text(encoding="utf-8").splitlines()
+        place = [lines[0].split(",").index(name) for name in ("x_m", "y_m", "z_m")]
+        rows = [line.split(",") for line in lines[1:]]
+        for row in rows:
+            for column in place:
+                row[column] = str(1e3 * float(row[column]))
+        truth = tmp_path / "truth.csv"
+        truth.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n", encoding="utf-8")
+        out = tmp_path / ("out.toml" if command == "calibrate" else "out")
+        array = folder / "board-array.toml"
+        outcome = run(command, folder / "board.csv", "--array", array, "--truth", truth, "--out", out)
+        assert "truth.csv: found positions" in outcome.err
+        assert "taken for millimetres" in outcome.err

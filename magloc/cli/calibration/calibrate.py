@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,7 +16,7 @@ import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_unwritable, write_files
 from arrays.io.tables import align
-from magloc.cli.framework import CommonOptions, Flag, note, print_result
+from magloc.cli.framework import CommonOptions, Flag, note, print_result, warn
 from magloc.cli.options import array_of_several, refuse_not_positive
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 _STRANGE = 4.0
 _TURNED = 3.0  # χ²/dof: 1.7 times the stated noise
 _ALIKE = 0.1  # largest difference of gains that have one cause
+_COMPARED = 300  # largest number of rows that are located to compare the truth with
 
 
 @Parameter(name="*", group="What is known of the array")
@@ -140,6 +142,7 @@ def calibrate(
         prior = _prior(known, nominal, array)
         rows = read_readings(readings, nominal)
         path = _path(rows, truth, height_m, readings)
+        _compare_with_fixes(nominal, rows, path)
         with naming(str(readings), array=str(array), truth=str(truth)):
             used, validation = _validated(nominal, without_saturated(rows, nominal), path, moment, prior)
             result = magloc.calibrate(used, rows, truth=path, moment=moment, prior=prior)
@@ -266,6 +269,20 @@ def _path(readings: Readings, path: Path | None, height_m: float | None, reading
     if not missing.any():
         raise InputError(f"--height-m: found z_m in {path}, expected a truth file without it.")
     return replace(truth, position_m=np.where(missing, height_m, truth.position_m))
+
+
+def _compare_with_fixes(array: SensorArray, rows: Readings, path: Truth | None) -> None:
+    """Warn where fixes with the array as it is show that the clock or the frame of the truth is another."""
+    import numpy as np
+
+    from magloc.truth import cause_of_disagreement
+
+    if path is None or np.isnan(path.position_m).any():
+        return
+    few = rows[np.linspace(0, len(rows) - 1, min(len(rows), _COMPARED)).astype(np.intp)]
+    with suppress(ValueError):
+        fixes = magloc.locate(array, few, body_length_m=0.0, exclude_faulty=False)
+        warn(filter(None, [cause_of_disagreement(path, fixes.time_s, fixes.position_m)]))
 
 
 def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]:

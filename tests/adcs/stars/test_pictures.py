@@ -89,6 +89,16 @@ class TestFiles:
                     r"found (no picture that can be read|a picture of shape|too many|\d+ × \d+).*", said
                 )
 
+    def test_a_masked_photograph_is_solved(self, tmp_path):
+        """A third of the picture is masked; the attitude stays within a fifth of a pixel of the true one."""
+        R = Rotation.random(random_state=8).as_matrix()
+        picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(9))
+        picture[:120], picture[:, 500:] = np.nan, np.nan
+        (tmp_path / "masked.fits").write_bytes(fits_bytes(picture[::-1], -32))
+        _, found = solve_photograph(read_picture(tmp_path / "masked.fits"), SKY)
+        off = np.linalg.norm(found.R_catalogue_from_frame[:, 2] - R[:, 2])
+        assert off < 0.2 * CAMERA.rad_per_px
+
     def test_refusals(self, tmp_path):
         (tmp_path / "no.png").write_bytes(b"no picture")
         Image.fromarray(np.zeros((20, 90), np.uint8)).save(tmp_path / "small.png")
