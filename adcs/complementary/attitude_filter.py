@@ -73,6 +73,12 @@ class AttitudeConfig:
     ------
     ValueError
         A name is unknown, or the lag is out of its range.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.AttitudeConfig(magnet="rejected", lag_s=0.013).lag_s
+    0.013
     """
 
     magnet: Magnet = "auto"
@@ -124,8 +130,15 @@ class AttitudeEstimate:
         Rate of the gyro without its bias, and the bias, body axes.
     offset_T : ndarray, shape (3,)
         Offset of the magnetometer, body axes; the field of a magnet that moves with the sensor.
-    flags : tuple of str
-        Names among those of :data:`adcs.complementary.attitude_filter.FLAGS`.
+    bits : int
+        Flags, one a bit; :attr:`flags` has their names.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> estimate = adcs.AttitudeFilter().update(0.0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8], [0.0, 20e-6, -43e-6])
+    >>> estimate.flags, estimate.disturbed
+    (('starting',), False)
     """
 
     time_s: float

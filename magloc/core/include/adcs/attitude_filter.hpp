@@ -38,7 +38,7 @@ class AttitudeFilter {
   static constexpr double up_step = 0.15, longest_up_step = 0.5 / up_step, usual_length = 0.1, unknown_bias = 0.01;
   static constexpr double start_rate = 0.0349065850398866, start_acceleration = 0.3, start_bias = 0.08726646259971647;
   static constexpr double shown_rad = 0.15, shown_s = 0.3, change_s = 1.0, lost_rad = 0.5, micro = 1e6;
-  static constexpr double largest_time = 1e14;
+  static constexpr double largest_time = 1e14, least_scatter = 0.1;
 
  public:
   static constexpr uint32_t version = 1;  // of the state's bytes
@@ -82,7 +82,7 @@ class AttitudeFilter {
     if (!is_started_) {
       const bool is_over = time_s >= begin_ + start_s && first_rate_.count > 0 && first_acceleration_.count > 0;
       if (is_over)
-        finish_start();
+        finish_start(time_ - dt);
       else
         return gather(dt, found);
     }
@@ -151,20 +151,26 @@ class AttitudeFilter {
       first_length_ += (length(*found[2]) - first_length_) / first_field_.count;
     }
     if (first_acceleration_.count > 0) level_ = turned_onto({1, {}}, first_acceleration_.mean(), unit_vector<Real>(2));
-    Real heading = 0;
-    if (first_field_.count > 0) heading = heading_.angle(rotate(level_, first_field_.mean()));
-    const double error = first_acceleration_.deviation() / 9.81;
-    const Real tilt = first_acceleration_.count > 0 ? Real(square_root(tilt_floor * tilt_floor + error * error))
-                                                    : Real(unknown_angle);
+    double tilt = unknown_angle * unknown_angle, heading = 0, variance = 0;
+    if (first_acceleration_.count > 0) {
+      const double scatter = first_acceleration_.deviation(), least = least_scatter;
+      tilt = tilt_floor * tilt_floor + (scatter * scatter + least * least / first_acceleration_.count) / (9.81 * 9.81);
+    }
+    if (first_field_.count > 0) {
+      const Vector<Real> field = rotate(level_, first_field_.mean());
+      const double noise = micro * model_.noise_T, horizontal = field[0] * field[0] + field[1] * field[1];
+      heading = heading_.angle(field);
+      variance = model_.start_rad * model_.start_rad + noise * noise / (first_field_.count * horizontal);
+    }
     if (found[0])
       for (int i = 0; i < 3; ++i) estimate_.rate[i] = (*found[0])[i];
-    finish(heading, tilt, first_field_.count > 0 ? model_.start_rad * model_.start_rad : Real(0),
+    finish(Real(heading), Real(square_root(tilt)), Real(variance),
            starting | (first_field_.count > 0 ? 0u : uint32_t(heading_relative)));
     return Status::ok;
   }
 
   // At the end of the first second: bias, direction up and field of a unit at rest.
-  void finish_start() {
+  void finish_start(double last) {
     const Vector<Real> mean = first_rate_.mean();
     const bool is_at_rest = first_rate_.deviation() < Real(start_rate) &&
                             first_acceleration_.deviation() < Real(start_acceleration) &&
@@ -175,12 +181,12 @@ class AttitudeFilter {
     level_ = turned_onto({1, {}}, first_acceleration_.mean(), unit_vector<Real>(2));
     up_.start(acceleration_read_, first_acceleration_, is_at_rest);
     is_started_ = true, started_ = time_;
-    heading_.begin(time_);
+    heading_.begin(last);
     best_up_ = Real(unknown_angle);
     estimate_.flags = is_at_rest ? 0u : uint32_t(moving_start);
     if (is_at_rest && first_field_.count > 0) {
       has_steady_ = true, steady_field_ = first_field_.mean(), steady_time_ = time_;
-      heading_.start(model_, config_.disturbance, time_, rotate(level_, first_field_.mean()), 0);
+      heading_.start(model_, config_.disturbance, last, rotate(level_, first_field_.mean()), 0);
     }
   }
 

@@ -199,7 +199,7 @@ class HeadingRun {
   };
   Outcome step(const HeadingRules<Real> &p, const HeadingBlock<Real> &block) {
     FieldInnovation<Real> update;
-    const HeadingFilter<Real> before = filter_;
+    if (trial_s_ < 0) others_[0] = filter_;  // where a trial would begin
     filter_.predict(block.turn, block.room);
     filter_.compare(p, block, update);
     const Real nis = update.nis, largest = 2 * p.gate;
@@ -216,16 +216,16 @@ class HeadingRun {
       wrong_s_ += block.dt;
       right_s_ = 0;
     }
-    if (trial_s_ < 0 && wrong_s_ > p.patience && p.evidence < infinity) begin_trial(p, before);
+    if (trial_s_ < 0 && wrong_s_ > p.patience && p.evidence < infinity) begin_trial(p);
     if (trial_s_ >= 0) outcome.accepted = try_others(p, block, update);
     return outcome;
   }
 
  private:
-  void begin_trial(const HeadingRules<Real> &p, const HeadingFilter<Real> &before) {
+  void begin_trial(const HeadingRules<Real> &p) {
     trial_s_ = 0, tried_ = 0;
+    for (int k = 1; k < n_explanations; ++k) others_[k] = others_[0];
     for (int k = 0; k < n_explanations; ++k) {
-      others_[k] = before;
       others_[k].grow(k == offset_changed ? state_offset : state_room, p.jump * p.jump);
       log_likelihoods_[k] = 0;
     }
