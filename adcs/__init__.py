@@ -6,6 +6,9 @@ from arrays.io.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
+        "AttitudeConfig": "adcs.complementary.attitude_filter",
+        "AttitudeEstimate": "adcs.complementary.attitude_filter",
+        "AttitudeFilter": "adcs.complementary.attitude_filter",
         "AttitudeTrack": "adcs.satellite.attitude_track",
         "BDot": "adcs.satellite.magnetic_control",
         "BoundedSystem": "adcs.ellipsoids.observer",

@@ -1,6 +1,9 @@
 from adcs import datasets as datasets
 from adcs import frames as frames
 from adcs import mockup as mockup
+from adcs.complementary.attitude_filter import AttitudeConfig as AttitudeConfig
+from adcs.complementary.attitude_filter import AttitudeEstimate as AttitudeEstimate
+from adcs.complementary.attitude_filter import AttitudeFilter as AttitudeFilter
 from adcs.complementary.explicit import Gains as Gains
 from adcs.complementary.filters import complementary_filter as complementary_filter
 from adcs.complementary.filters import inertial_magnetic_filter as inertial_magnetic_filter

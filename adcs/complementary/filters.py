@@ -5,16 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
+from adcs.complementary.attitude_filter import AttitudeConfig, filter_rows
 from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track
 from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, rotate_to_north
-from adcs.complementary.inertial_magnetic import InertialMagneticRecord, check_units, prepare
+from adcs.complementary.inertial_magnetic import (
+    InertialMagneticRecord,
+    check_units,
+    log_warnings,
+    magnetometer_lag,
+    prepare,
+)
 from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
@@ -190,51 +197,100 @@ def inertial_magnetic_filter(
     field = np.full_like(rate, np.nan) if field_T is None else numbers(field_T)
     record = InertialMagneticRecord(times, rate, acceleration, field, gyro_samples)
     check_units(record)
-    prepared = prepare(record, model, offline=offline)
+    found = _smoothed(record, magnet, model) if offline else _filtered(record, magnet, model)
+    of_tilt = found.tilt_sigma_rad / math.sqrt(2.0)
+    return AttitudeTrack(
+        title=f"inertial and magnetic filter, magnet {magnet}{', offline' if offline else ''}",
+        time_s=times,
+        rows=np.arange(len(times)),
+        q=found.q,
+        states={"rate": found.rate_rad_s, "gyro-bias": found.bias_rad_s},
+        used=("accelerometer", "magnetometer") if record.has_field else ("accelerometer",),
+        seen={
+            "accelerometer": is_read(record.acceleration_m_s2),
+            "magnetometer": is_read(record.field_T) & ~found.left_out,
+        },
+        sigma={
+            "attitude": _body_sigma(found.q, of_tilt, found.heading_sigma_rad),
+            "level": np.stack([of_tilt, of_tilt, found.heading_sigma_rad], axis=-1),
+        },
+        warnings=(
+            *found.warnings,
+            *(() if record.has_field else (_RELATIVE.format(math.degrees(found.heading_sigma_rad[-1])),)),
+            *_gyro_only_minutes(times, found.left_out),
+            *_doubted_times(times, found.doubted),
+        ),
+        degraded={
+            LEFT_OUT: found.left_out,
+            SUBTRACTED: found.subtracted,
+            LOST: found.heading_sigma_rad > LOST_RAD,
+            DOUBTED: found.doubted,
+        },
+    )
+
+
+class _Attitudes(NamedTuple):
+    """Attitudes of a record, each (n,) or (n, k)."""
+
+    q: FloatArray
+    rate_rad_s: FloatArray
+    bias_rad_s: FloatArray
+    tilt_sigma_rad: FloatArray
+    heading_sigma_rad: FloatArray
+    left_out: BoolArray
+    subtracted: BoolArray
+    doubted: BoolArray
+    warnings: tuple[str, ...]
+
+
+def _filtered(record: InertialMagneticRecord, magnet: Magnet, model: HeadingModel) -> _Attitudes:
+    """Run the filter for one reading at a time over a record, with the lag of the record."""
+    config = AttitudeConfig(magnet, record.gyro_samples, magnetometer_lag(record), model)
+    rows = filter_rows(config, record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T)
+    if rows.status.any():
+        raise ValueError(f"Input time_s must be within 1e14 s; instead received {np.abs(record.time_s).max():g} s.")
+    left_out, subtracted, doubted = map(rows.has_flag, ("field-left-out", "magnet-subtracted", "heading-doubtful"))
+    tilt, heading = rows.sigma.T
+    return _Attitudes(
+        rows.q,
+        rows.corrected_rate,
+        rows.bias,
+        tilt,
+        heading,
+        left_out,
+        subtracted,
+        doubted,
+        log_warnings(record, model),
+    )
+
+
+def _smoothed(record: InertialMagneticRecord, magnet: Magnet, model: HeadingModel) -> _Attitudes:
+    """Estimate each attitude from the whole record."""
+    prepared = prepare(record, model, offline=True)
     model = replace(model, gyro_drift_rad_s=max(model.gyro_drift_rad_s, prepared.bias_sigma_rad_s))
-    turns = times, prepared.rate_rad_s, prepared.q_level
+    turns = record.time_s, prepared.rate_rad_s, prepared.q_level
     if record.has_field:
         heading = heading_track(
             *turns,
             prepared.field_T,
             _limit_model(magnet, model),
-            offline=offline,
+            offline=True,
             hidden_rad2=prepared.hidden_rad2,
             start_tilt_rad=prepared.start_tilt_rad,
         )
     else:
         heading = relative_heading(*turns, model, hidden_rad2=prepared.hidden_rad2)
-    q = rotate_to_north(prepared.q_level, heading.heading_rad)
-    of_tilt = prepared.tilt_sigma_rad / math.sqrt(2.0)
-    changed = heading.changes.size > 0
-    subtracted = changed & (np.linalg.norm(heading.offset_T, axis=1) > _MAGNET * model.offset_T)
-    return AttitudeTrack(
-        title=f"inertial and magnetic filter, magnet {magnet}{', offline' if offline else ''}",
-        time_s=times,
-        rows=np.arange(len(times)),
-        q=q,
-        states={"rate": prepared.rate_rad_s, "gyro-bias": prepared.bias_rad_s},
-        used=("accelerometer", "magnetometer") if record.has_field else ("accelerometer",),
-        seen={
-            "accelerometer": is_read(record.acceleration_m_s2),
-            "magnetometer": is_read(record.field_T) & ~heading.left_out,
-        },
-        sigma={
-            "attitude": _body_sigma(q, of_tilt, heading.sigma_rad),
-            "level": np.stack([of_tilt, of_tilt, heading.sigma_rad], axis=-1),
-        },
-        warnings=(
-            *prepared.warnings,
-            *(() if record.has_field else (_RELATIVE.format(math.degrees(heading.sigma_rad[-1])),)),
-            *_gyro_only_minutes(times, heading.left_out),
-            *_doubted_times(times, heading.doubted),
-        ),
-        degraded={
-            LEFT_OUT: heading.left_out,
-            SUBTRACTED: subtracted,
-            LOST: heading.sigma_rad > LOST_RAD,
-            DOUBTED: heading.doubted,
-        },
+    has_magnet = heading.changes.size > 0
+    return _Attitudes(
+        rotate_to_north(prepared.q_level, heading.heading_rad),
+        prepared.rate_rad_s,
+        prepared.bias_rad_s,
+        prepared.tilt_sigma_rad,
+        heading.sigma_rad,
+        heading.left_out,
+        has_magnet & (np.linalg.norm(heading.offset_T, axis=1) > _MAGNET * model.offset_T),
+        heading.doubted,
+        prepared.warnings,
     )
 
 

@@ -47,7 +47,8 @@ _START_BIAS_RAD_S = math.radians(5.0)
 _UNKNOWN_BIAS_RAD_S = 0.01  # standard deviation for a gyro that is never at rest
 _LAG_WINDOW_S = 0.2
 _LAG_EVERY_S = 0.01  # closer readings are redundant
-_LONGEST_LAG_S = 0.04
+LONGEST_LAG_S = 0.04
+"""Longest lag of a magnetometer behind the gyro [s]."""
 _USUAL_LENGTH = 0.1  # largest relative difference of the length of an undisturbed field
 _LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # larger readings have another unit
 
@@ -212,11 +213,7 @@ def prepare(
     """
     time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
     moves = start_motion(record, bias[0])
-    read = {
-        "gyro": is_read(record.rate_rad_s),
-        "accelerometer": is_read(record.acceleration_m_s2),
-        "magnetometer": is_read(record.field_T),
-    }
+    read = _sensors_read(record)
     bias_sigma = 0.0
     if not bias.any():
         bias_sigma = _UNKNOWN_BIAS_RAD_S if moves else 0.0
@@ -243,8 +240,6 @@ def prepare(
             useful[before + 1 : after] = False
         field_T = np.where(useful[:, None], field_T, np.nan)
         start_tilt = float(up.sigma_rad[np.argmax(useful & read["magnetometer"])])
-    else:
-        del read["magnetometer"]
     more_rad2 = up.sigma_rad**2 + (GRAVITY_TIME_S * bias_sigma) ** 2 + up.drift_rad**2
     hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
     return PreparedReadings(
@@ -301,6 +296,32 @@ def _tilt_sigma_rad(
     return np.minimum(sigma, UNKNOWN_RAD)
 
 
+def magnetometer_lag(record: InertialMagneticRecord) -> float:
+    """Return the lag of the magnetometer behind the gyro [s]; zero without a magnetometer or rotations."""
+    if not record.has_field:
+        return 0.0
+    rate = step_rates(_extend_to_start(record.rate_rad_s - rest_bias(record)), record.dt_s, record.gyro_samples)
+    return _lag_s(gyro_attitudes(rate, record.dt_s), record)
+
+
+def log_warnings(record: InertialMagneticRecord, model: HeadingModel) -> tuple[str, ...]:
+    """Return sentences on a start in motion and on gaps of the sensors."""
+    time_s, bias = record.time_s, rest_bias(record)
+    moves = start_motion(record, bias[0])
+    read = _sensors_read(record)
+    gaps = sensor_gaps(time_s, read["gyro"])
+    hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
+    hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
+    bias_sigma = _UNKNOWN_BIAS_RAD_S if moves and not bias.any() else 0.0
+    return (*_start_warnings(moves, bias_sigma), *gap_warnings(time_s, read, gaps[np.array(hides, np.bool_)]))
+
+
+def _sensors_read(record: InertialMagneticRecord) -> dict[str, BoolArray]:
+    """Return the rows (n,) with a reading of each sensor that the record has."""
+    read = {"gyro": is_read(record.rate_rad_s), "accelerometer": is_read(record.acceleration_m_s2)}
+    return {**read, "magnetometer": is_read(record.field_T)} if record.has_field else read
+
+
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     """Return the lag for which the field in a fixed frame changes least within a fifth of a second.
 
@@ -312,7 +333,7 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     rows = rows[:: instants_within(_LAG_EVERY_S, time_s[rows])]
     apart = instants_within(_LAG_WINDOW_S, time_s[rows])
     good = _has_usual_length(record)[rows]
-    most = round(_LONGEST_LAG_S / step)
+    most = round(LONGEST_LAG_S / step)
     changes = np.zeros(most + 1)
     work = core.problem(
         "lags",
@@ -330,9 +351,9 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     core.run("lag_changes", work, len(changes), block=1)
     least = int(np.argmin(changes))
     if not 0 < least < most:
-        return least * step
+        return min(least * step, LONGEST_LAG_S)
     a, b, c = changes[least - 1 : least + 2]
-    return (least + 0.5 * (a - c) / (a - 2.0 * b + c)) * step
+    return min((least + 0.5 * (a - c) / (a - 2.0 * b + c)) * step, LONGEST_LAG_S)
 
 
 def _has_usual_length(record: InertialMagneticRecord) -> BoolArray:

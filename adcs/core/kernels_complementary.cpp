@@ -1,27 +1,7 @@
 // Filters of a gyro and two vectors, and what an inertial unit shows without a magnetometer.
 #include "adcs/complementary.hpp"
+#include "adcs/inertial.hpp"
 #include "magloc/kernel.hpp"
-
-MAGLOC_BEGIN
-// exp(-a) cos a and exp(-a) sin a for a > 0, by the power series of exp((i - 1) a). A large a is halved until it is
-// small enough, and the result squared as often.
-inline void damped_rotation(double a, double &cosine, double &sine) {
-  int halved = 0;
-  for (; a > 0.05 && halved < 64; ++halved) a *= 0.5;
-  cosine = 1.0, sine = 0.0;
-#pragma GCC unroll 9
-  for (int n = 9; n > 0; --n) {
-    const double sum = cosine + sine, difference = cosine - sine;
-    cosine = 1.0 - a * (1.0 / n) * sum;
-    sine = a * (1.0 / n) * difference;
-  }
-  for (; halved > 0; --halved) {
-    const double square = cosine * cosine - sine * sine;
-    sine = 2.0 * cosine * sine;
-    cosine = square;
-  }
-}
-MAGLOC_END
 
 using namespace magloc;
 
@@ -86,7 +66,7 @@ MAGLOC_KERNEL(level_attitudes, level) {
   if (begin == 0) *level_from_gyro = quaternion_at(p.start);
   for (int64_t i = begin; i < end; ++i) {
     const Vector<double> up = rotate(*level_from_gyro, normalised(vector_at(p.up + 3 * i)));
-    const Quaternion<double> turn = exponential({{p.part[i] * up[1], -p.part[i] * up[0], 0.0}});
+    const Quaternion<double> turn = exponential(Vector<double>{{p.part[i] * up[1], -p.part[i] * up[0], 0.0}});
     *level_from_gyro = normalised(turn * *level_from_gyro);
     store(*level_from_gyro * quaternion_at(p.q_gyro + 4 * i), p.q + 4 * i);
   }
@@ -95,26 +75,21 @@ MAGLOC_KERNEL(level_attitudes, level) {
 
 MAGLOC_KERNEL(low_pass, butterworth) {
   const magloc_butterworth &p = *problem;
-  struct Column {
-    double output, slope, input;  // the slope in units of s
-  };
   Workspace memory(workspace);
-  auto *columns = memory.take<Column>(p.n_columns);
+  auto *columns = memory.take<LowPass<double>>(p.n_columns);
   if (!workspace) return memory.size();
   if (begin == 0)
-    for (int64_t k = 0; k < p.n_columns; ++k) columns[k] = {p.start[k], 0.0, p.start[k]};
+    for (int64_t k = 0; k < p.n_columns; ++k) columns[k].start(p.start[k]);
   for (int64_t i = begin; i < end; ++i) {
     double cosine, sine;
     damped_rotation(p.steps[i], cosine, sine);
     for (int64_t k = 0; k < p.n_columns; ++k) {
-      Column &column = columns[k];
+      LowPass<double> &column = columns[k];
       const double value = p.values[p.n_columns * i + k], input = value == value ? value : column.input;
-      if (i > 0) {
-        const double mean = 0.5 * (column.input + input), z = column.output - mean, slope = column.slope;
-        column.output = mean + z * cosine + (slope + z) * sine;
-        column.slope = slope * cosine - (slope + 2.0 * z) * sine;
-      }
-      column.input = input;
+      if (i > 0)
+        column.step(cosine, sine, input);
+      else
+        column.input = input;
       p.out[p.n_columns * i + k] = column.output;
     }
   }

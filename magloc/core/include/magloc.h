@@ -184,6 +184,23 @@ typedef struct {
 } magloc_heading;
 int64_t magloc_heading_filter(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_heading_smoother(const magloc_heading *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Attitude of an inertial unit, reading by reading; an item is a row, all in order. The state of the filter is the
+   caller's: zero at first, it goes on from row to row and from call to call. */
+typedef struct {
+  const double *model;                       /* (22,), adcs.HeadingModel */
+  double lag;                                /* of the magnetometer, s */
+  int64_t is_point_sample, disturbance;      /* 0 automatic, 1 reject, 2 subtract, 3 keep */
+  const double *time;                        /* (n,), s */
+  const double *rate, *acceleration, *field; /* (n, 3), rad/s, m/s^2, T; NaN where missing */
+  double *state;                             /* (attitude_filter_size doubles); resume: whether it has one */
+  int64_t resume;
+  double *q, *sigma;                      /* (n, 4) east, north, up from body; (n, 2) of tilt and heading, rad */
+  double *corrected_rate, *bias, *offset; /* (n, 3), rad/s, rad/s, T */
+  int64_t *flags, *status;                /* (n,), of AttitudeFlag and Status */
+} magloc_attitude;
+int64_t magloc_attitude_filter(const magloc_attitude *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Rotation of satellites whose wheels follow a reference, from one instant to another; an item is a run.
    The first instant of q, w and momentum is the start. Torque and dipole are held from each instant to the next. */
 typedef struct {

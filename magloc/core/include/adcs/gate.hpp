@@ -122,23 +122,6 @@ class Contest {
 
 inline bool is_finite(double x) { return x - x == 0.0; }
 
-// The attitude after the shortest turn that makes a direction in body axes that of the reference frame.
-inline Quaternion<double> turned_onto(const Quaternion<double> &q, const Vector<double> &body,
-                                      const Vector<double> &reference) {
-  const Vector<double> there = rotate_back(q, reference);
-  const double inverse = 1.0 / square_root(dot(body, body) * dot(reference, reference));
-  const double cosine = dot(body, there) * inverse;
-  Quaternion<double> turn = {1.0 + cosine, inverse * cross(body, there)};
-  if (1.0 + cosine < 1e-12) {
-    // Half a turn is one about any axis across.
-    int least = 0;
-    for (int i = 1; i < 3; ++i)
-      if (__builtin_fabs(body[i]) < __builtin_fabs(body[least])) least = i;
-    turn = {0.0, cross(body, unit_vector<double>(least))};
-  }
-  return normalised(q * turn);
-}
-
 // The attitude after the turn about a unit axis that brings a direction nearest to that of the reference frame.
 inline Quaternion<double> turned_about(const Quaternion<double> &q, const Vector<double> &axis,
                                        const Vector<double> &body, const Vector<double> &reference) {

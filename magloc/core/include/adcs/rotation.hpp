@@ -47,6 +47,10 @@ template <class T>
 MAGLOC_INLINE Vector<T> normalised(const Vector<T> &v) {
   return inverse_root(dot(v, v)) * v;
 }
+MAGLOC_INLINE Vector<float> operator*(double scale, const Vector<float> &v) {
+  const float s = (float)scale;
+  return {{s * v[0], s * v[1], s * v[2]}};
+}
 // Whether no component is NaN, as those of a missing reading are.
 MAGLOC_INLINE bool is_read(const Vector<double> &v) { return dot(v, v) >= 0.0; }
 // e_i, the unit vector of axis i.
@@ -101,6 +105,9 @@ template <class S, class T>
 MAGLOC_INLINE Quaternion<T> operator*(const S &scale, const Quaternion<T> &q) {
   return {scale * q.scalar, scale * q.vector};
 }
+MAGLOC_INLINE Quaternion<float> operator*(double scale, const Quaternion<float> &q) {
+  return {(float)scale * q.scalar, scale * q.vector};
+}
 template <class T>
 MAGLOC_INLINE Quaternion<T> conjugate(const Quaternion<T> &q) {
   return {q.scalar, -1.0 * q.vector};
@@ -149,6 +156,23 @@ MAGLOC_INLINE Vector<T> error_vector(const Quaternion<T> &from, const Quaternion
   return choose(turn.scalar < 0.0, broadcast<T>(-1.0), broadcast<T>(1.0)) * turn.vector;
 }
 
+// The attitude after the shortest turn that makes a direction in body axes that of the reference frame.
+template <class T>
+inline Quaternion<T> turned_onto(const Quaternion<T> &q, const Vector<T> &body, const Vector<T> &reference) {
+  const Vector<T> there = rotate_back(q, reference);
+  const T inverse = 1 / square_root(dot(body, body) * dot(reference, reference));
+  const T cosine = dot(body, there) * inverse;
+  Quaternion<T> turn = {1 + cosine, inverse * cross(body, there)};
+  if (1.0 + cosine < 1e-12) {
+    // Half a turn is one about any axis across.
+    int least = 0;
+    for (int i = 1; i < 3; ++i)
+      if (__builtin_fabs(body[i]) < __builtin_fabs(body[least])) least = i;
+    turn = {T(0), cross(body, unit_vector<T>(least))};
+  }
+  return normalised(q * turn);
+}
+
 // (cos t/2, n sin t/2) of a rotation vector t n, by power series of h = t/2, exact to rounding up to h^2 = 0.04. A
 // longer rotation is halved until it is short enough, and its quaternion squared as often.
 inline Quaternion<double> exponential(Vector<double> v) {
@@ -156,7 +180,7 @@ inline Quaternion<double> exponential(Vector<double> v) {
   int halved = 0;
   for (; square > 0.04 && halved < 64; ++halved) v = 0.5 * v, square *= 0.25;
   double cosine = 1.0, sine = 1.0;  // cos h and sin(h)/h
-#pragma GCC unroll 5
+  MAGLOC_UNROLL
   for (int i = 10; i > 0; i -= 2) {
     cosine = 1.0 - square * (1.0 / (i * (i - 1))) * cosine;
     sine = 1.0 - square * (1.0 / (i * (i + 1))) * sine;
@@ -164,5 +188,9 @@ inline Quaternion<double> exponential(Vector<double> v) {
   Quaternion<double> q = {cosine, 0.5 * sine * v};
   for (; halved > 0; --halved) q = q * q;
   return q;
+}
+inline Quaternion<float> exponential(const Vector<float> &v) {
+  const Quaternion<double> q = exponential(Vector<double>{{v[0], v[1], v[2]}});
+  return {(float)q.scalar, {{(float)q.vector[0], (float)q.vector[1], (float)q.vector[2]}}};
 }
 MAGLOC_END

@@ -16,6 +16,7 @@
   X(lag_changes, lags)                        \
   X(heading_filter, heading)                  \
   X(heading_smoother, heading)                \
+  X(attitude_filter, attitude)                \
   X(attitude_motion_runs, attitude_motion)    \
   X(small_motion_runs, small_motion)          \
   X(ellipsoids_predict, ellipsoids)           \

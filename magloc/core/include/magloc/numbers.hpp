@@ -20,13 +20,17 @@
 #define MAGLOC_END \
   }                \
   }
-#if defined(__GNUC__)
+#if defined(__OPTIMIZE_SIZE__)
+#define MAGLOC_INLINE inline
+#elif defined(__GNUC__)
 #define MAGLOC_INLINE inline __attribute__((always_inline))
 #else
 #define MAGLOC_INLINE inline
 #endif
 // Before a loop of few turns: repeat its body, so that arrays with its index become registers.
-#if defined(__clang__)
+#if defined(__OPTIMIZE_SIZE__)
+#define MAGLOC_UNROLL
+#elif defined(__clang__)
 #define MAGLOC_UNROLL _Pragma("unroll")
 #elif defined(__GNUC__)
 #define MAGLOC_UNROLL _Pragma("GCC unroll 16")
@@ -38,6 +42,7 @@ MAGLOC_BEGIN
 constexpr double infinity = __builtin_inf(), nan = __builtin_nan("");
 
 MAGLOC_INLINE double square_root(double x) { return __builtin_sqrt(x); }
+MAGLOC_INLINE float square_root(float x) { return __builtin_sqrtf(x); }
 MAGLOC_INLINE double choose(bool condition, double a, double b) { return condition ? a : b; }
 MAGLOC_INLINE double get_lane(double x, int) { return x; }
 MAGLOC_INLINE void set_lane(double &x, int, double value) { x = value; }
