@@ -25,6 +25,7 @@ from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag
+from magloc.surveying.fit.sensor_noise import NOISY, white_noise_T
 from magloc.surveying.piece import Ground, strongest_sources
 from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings
 from magloc.surveying.survey import tile_rows
@@ -33,7 +34,7 @@ from magloc.terrain.surface import Terrain
 GAP = 3.0
 """Shortest gap, in usual intervals."""
 _JITTER, _MISSING, _SPIKES = 0.1, 0.01, 1e-3  # shares that are faults
-_NOISY = 2.0  # times the stated noise
+_LEAST_LEVEL = 0.2  # least horizontal share of the ambient field: near the poles it is small
 _SIGNIFICANT = 3.0  # standard deviations of the lag and of the heading error
 _WIDE = 1.7  # times the spacing of lines
 _NEAR = 0.75  # distance of a covered place from a line, in spacings
@@ -115,6 +116,8 @@ class Quality(Result):
         Median modulus of each sensor; NaN without any.
     held : float
         Share of rows whose place stands still between fixes of the receiver.
+    level_share : float
+        Horizontal share of the ambient field: the heading error by a level field of 1 that is fixed to the array.
 
     Examples
     --------
@@ -148,6 +151,7 @@ class Quality(Result):
     coverage: Coverage | None
     field_T: FloatArray
     held: float
+    level_share: float = 1.0
 
     @property
     def interval_s(self) -> float:
@@ -231,9 +235,10 @@ class Quality(Result):
                 is_whole = self.array.common_field_T is None
                 remark = "" if not is_whole or EARTH_T[0] < field_T < EARTH_T[1] else "not the Earth's field: is it nT?"
                 yield Check("field", sensor.id, 1e9 * field_T, "nT", remark)
-            stated_T = float(self.array.channel_noise_T[self.array.channel_sensor == i].max())
+            stated_T = float(white_noise_T(self.array)[self.array.channel_sensor == i].max())
             noise_T = float(self.noise_T[i])
-            remark = f"{noise_T / stated_T:.1f} times the stated noise" if noise_T > _NOISY * stated_T else ""
+            times = f"{noise_T / stated_T:.1f} times the stated noise: noise_nT = {1e9 * noise_T:.2g}"
+            remark = times if noise_T > NOISY * stated_T else ""
             yield Check("noise", sensor.id, 1e9 * noise_T, "nT", remark)
             for name, which, most in (
                 ("missing", self.missing, _MISSING),
@@ -245,13 +250,14 @@ class Quality(Result):
                 yield Check(name, sensor.id, 100.0 * share, "%", remark)
             error = self.heading[i]
             if error is not None:
-                is_wrong = error.amplitude_T > max(_SIGNIFICANT * error.sigma_T, _NOISY * stated_T)
+                least_T = max(_SIGNIFICANT * error.sigma_T, NOISY * stated_T, sensor.offset_uncertainty_T)
+                state = f"offset_uncertainty_nT = {1e9 * error.amplitude_T / self.level_share:.2g}"
                 yield Check(
                     "heading error",
                     sensor.id,
                     1e9 * error.amplitude_T,
                     "nT",
-                    "changes with the course" if is_wrong else "",
+                    f"changes with the course: {state}" if error.amplitude_T > least_T else "",
                 )
                 yield Check("heading error ±", sensor.id, 1e9 * error.sigma_T, "nT", "")
 
@@ -353,6 +359,7 @@ def check_quality(
         coverage,
         np.array([finite_median(column) for column in moduli_T.T]),
         held,
+        _level_share(rows),
     )
 
 
@@ -384,6 +391,14 @@ def _without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
     if rows.ambient_T is None:
         return moduli_T
     return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
+
+
+def _level_share(rows: Readings) -> float:
+    """Return the horizontal share of the ambient field; 1 where that is not known."""
+    if rows.ambient_T is None or rows.array_rotation is None:
+        return 1.0
+    east, north, up = rows.array_rotation.apply(rows.ambient_T).mean(axis=0)
+    return max(math.hypot(east, north) / math.hypot(east, north, up), _LEAST_LEVEL)
 
 
 def _coverage(xy_m: FloatArray, lines: Sequence[FlightLine]) -> Coverage | None:

@@ -14,7 +14,8 @@ from arrays.logs.places import array_origins
 from arrays.typing import FloatArray
 
 _LOG = logging.getLogger(__name__)
-_APART_M = 0.05  # below it a wrong heading matters no more than errors of places
+APART_M = 0.05
+"""Distance of sensors on the map below which a wrong heading matters no more than errors of places."""
 CHORD_M = 2.0
 """Length over which the course is measured."""
 
@@ -44,7 +45,7 @@ def turned_to_course(table: Table, array: SensorArray, columns: LogColumns) -> T
     if not columns.course:
         apart_m = float(np.ptp(array.positions[:, :2], axis=0).max())
         attitudes = table.values[:, [i for i, name in enumerate(table.header) if name in ROTATION_COLUMNS]]
-        if columns.is_placed and apart_m > _APART_M and (attitudes == [0.0, 0.0, 0.0, 1.0]).all():
+        if columns.is_placed and apart_m > APART_M and (attitudes == [0.0, 0.0, 0.0, 1.0]).all():
             _LOG.warning(
                 f"{table.path}: found no attitude for sensors that are up to {apart_m:.2g} m apart on the map; x of the"
                 " array counts as east. State angles in the table columns, or course = true if x is ahead"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.navigation.course import chords
 
 _LONGEST_GAP = 20.0  # in usual steps of time
@@ -75,17 +75,22 @@ def _straight_rows(time_s: FloatArray, place_m: FloatArray) -> Iterator[tuple[st
 
 def _line_starts(xy_m: FloatArray) -> list[int]:
     """Return the first rows of lines in a piece without a gap: its first row, and rows where turns end."""
-    way, back, forth, chord = chords(xy_m)
+    way, _, _, chord = chords(xy_m)
     if not chord:
         return [0]
-    turn = np.abs(np.arctan2(back[:, 0] * forth[:, 1] - back[:, 1] * forth[:, 0], (back * forth).sum(axis=1)))
-    turn[(way < chord) | (way > way[-1] - chord)] = 0.0  # beyond the ends there is no course
-    turning = turn > np.radians(_TURN_deg)
-    starts = [0]
+    turning, starts = rows_of_turns(xy_m), [0]
     for end in np.flatnonzero(turning[:-1] & ~turning[1:]) + 1:
         if way[end] - way[starts[-1]] > _SHORTEST * chord and way[-1] - way[end] > _SHORTEST * chord:
             starts.append(int(end))
     return starts
+
+
+def rows_of_turns(xy_m: FloatArray) -> BoolArray:
+    """Return the rows (n,) in which the courses over two metres before and after differ by more than 35°."""
+    way, back, forth, chord = chords(xy_m)
+    turn = np.abs(np.arctan2(back[:, 0] * forth[:, 1] - back[:, 1] * forth[:, 0], (back * forth).sum(axis=1)))
+    turn[(way < chord) | (way > way[-1] - chord)] = 0.0  # beyond the ends there is no course
+    return np.asarray(turn > np.radians(_TURN_deg))
 
 
 def covers_area(xy_m: FloatArray) -> bool:

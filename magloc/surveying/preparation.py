@@ -13,11 +13,14 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.measurement.rows import check_magnitudes, check_order
 from magloc.measurement.screening import wild_readings
+from magloc.navigation.course import APART_M
 from magloc.navigation.fixes import between_fixes, interval_of_fixes
+from magloc.navigation.flight_lines import rows_of_turns
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
+from magloc.surveying.error_components import unstated_pose
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.pose_components import UNSTATED
+from magloc.surveying.fit.sensor_noise import white_noise_T, with_measured_noise
 from magloc.terrain.surface import FLAT, Terrain
 
 _LOG = logging.getLogger(__name__)
@@ -71,13 +74,13 @@ def whole_rows(
     readings = _some(readings, whole)
     check_order(readings)
     readings = _some(readings, ~leaping_rows(readings))
+    readings = _some(readings, ~rows_without_attitude(array, readings))
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
     array = with_stated_pose(array, readings)
-    array = replace(array, pose=UNSTATED) if array.pose is None else array
+    array = replace(array, pose=unstated_pose(array)) if array.pose is None else array
     ambient = _ambient_T(array, readings)
-    return array, replace(
-        readings, ambient_T=ambient if base is None else vary_with_base(ambient, readings.time_s, base)
-    )
+    readings = replace(readings, ambient_T=ambient if base is None else vary_with_base(ambient, readings.time_s, base))
+    return with_measured_noise(array, readings), readings
 
 
 def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[SensorArray, Readings]:
@@ -120,7 +123,7 @@ def unusable_readings(
     for i, arm_m in enumerate(array.positions.copy()):
         place_m = readings.array_position_m + readings.array_rotation.apply(arm_m)
         depth_m = max(float(np.quantile(terrain.flatten(place_m)[:, 2], _LOWEST)) - shallowest_m, _LEAST_DEPTH_M)
-        noise_T = float(array.channel_noise_T[array.channel_sensor == i].max())
+        noise_T = float(white_noise_T(array)[array.channel_sensor == i].max())
         wild[:, i] = wild_readings(moduli[:, i], place_m, depth_m, noise_T, jitter_m)
     return stuck, wild, np.asarray(np.isnan(moduli) | wild)
 
@@ -174,6 +177,23 @@ def leaping_rows(readings: Readings) -> BoolArray:
             f" {time_s[k + 1]:.15g} s that are {way[k]:.4g} m apart."
         )
     return np.asarray(wild)
+
+
+def rows_without_attitude(array: SensorArray, readings: Readings) -> BoolArray:
+    """Return the rows (n,) of turns, if the attitude is the course and sensors are apart on the map.
+
+    In a turn the course over some metres is not the attitude.
+    """
+    none = np.zeros(len(readings), np.bool_)
+    if array.columns is None or not array.columns.course or np.ptp(array.positions[:, :2], axis=0).max() < APART_M:
+        return none
+    assert readings.array_position_m is not None
+    turning = rows_of_turns(readings.array_position_m[:, :2])
+    if not none.size - turning.sum() >= FEWEST_ROWS:
+        return none
+    if turning.any():
+        _LOG.warning(f"{turning.sum()} rows of turns, whose attitude the course does not tell, are left out")
+    return turning
 
 
 def record_of(

@@ -20,6 +20,7 @@ MOST_ROUNDS = 60
 _MOST_IN_VAIN = 4  # rounds without a new source; near strong sources and edges of tiles some candidates always remain
 _MOST_OF_MISFITS, _MISFIT = 8, 1.5  # the same while χ² per reading exceeds a limit
 _PROGRESS, _WORSE = 0.999, 1.02
+_PROGRESS_OF_MISFITS = 0.98  # errors larger than stated make false sources without end, each of which explains little
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
 _FELT = 0.3  # smallest change of sources that counts, in units of the noise of a group of rows
@@ -212,15 +213,15 @@ def find_sources(
     searched = SearchState.empty(wide, groups, grid)
     for number in range(most):
         fit, background = wide.fit(sources, group, _SETTLED_COARSELY)
-        at_once = _MOST_AT_ONCE
+        at_once, misfits = _MOST_AT_ONCE, fit.cost > _MISFIT * fit.residual.size
         if fit.cost > _WORSE * least:
             # Too many at once made the fit worse: return to the best one and add one at a time.
             fit, background = wide.fit(best, group, _SETTLED_COARSELY)
             at_once = 1
-        elif fit.cost < min(_PROGRESS * least, least - model.threshold):
+        elif fit.cost < min((_PROGRESS_OF_MISFITS if misfits else _PROGRESS) * least, least - model.threshold):
             tried, in_vain = np.zeros((0, 3)), 0
         in_vain += 1
-        if in_vain > (_MOST_OF_MISFITS if fit.cost > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
+        if in_vain > (_MOST_OF_MISFITS if misfits else _MOST_IN_VAIN):
             break
         best, least = fit.sources, min(least, fit.cost)
         if number == most - 1:

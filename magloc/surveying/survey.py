@@ -139,7 +139,11 @@ def survey(
     at_once = min(core.threads() if processes is None else processes, len(tiled.tiles))
     with workers(at_once, scheduler, folder) as each:
         # Strong sources beside a tile mask all others until they are known.
-        tiled, lag = tiled.settle(strongest_sources, each, tell)[0].correct_lag(assumed)
+        tiled = tiled.search(strongest_sources, range(len(tiled.tiles)), each, tell)
+        with_offsets = tiled.with_likeliest_offsets()
+        again = tiled.changes() if with_offsets is tiled else range(len(tiled.tiles))
+        tiled, _ = with_offsets.settle(strongest_sources, each, tell, again)
+        tiled, lag = tiled.correct_lag(assumed)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show;"

@@ -16,11 +16,12 @@ from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag, SmoothTrack, Trial, estimate_lag, fit_at_lag
+from magloc.surveying.error_components import with_likeliest_offsets, with_likeliest_pose
 from magloc.surveying.fit.joint_fit import Sources
+from magloc.surveying.fit.sensor_noise import white_noise_T
 from magloc.surveying.piece import HIGHEST_M, Ground, Piece, high_above
-from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
-from magloc.surveying.rounds import AT_LAST
+from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING
 from magloc.surveying.tiles import Tile, assign_sources, tiles_of
 
 _LOG = logging.getLogger(__name__)
@@ -135,7 +136,7 @@ class TiledSurvey:
         own, near = tile.contains(position), tile.inside_m(position) > -self.margin_m - _BESIDE_M
         places = self._places(tile)
         apart = np.linalg.norm(position - np.clip(position, places.min(axis=0), places.max(axis=0)), axis=1)
-        felt = 2e-7 * strength > _FELT * self.array.channel_noise_T.min() * apart**3
+        felt = 2e-7 * strength > _FELT * white_noise_T(self.array).min() * apart**3
         return self.sources.some(own), self.sources.some(near & ~own), self.sources.some(felt & ~near)
 
     def _places(self, tile: Tile) -> FloatArray:
@@ -160,15 +161,19 @@ class TiledSurvey:
             tiled = replace(tiled, sources=sources, found=found, known=known, outside=outside)
         return tiled
 
-    def settle(self, work: Work, each: Each, tell: Tell) -> tuple[TiledSurvey, Sequence[int]]:
-        """Search all tiles, then again those whose neighbours report changes; return also tiles that still change."""
-        tiled, due = self, range(len(self.tiles))
-        left: Sequence[int] = due
+    def settle(
+        self, work: Work, each: Each, tell: Tell, due: Sequence[int] | None = None
+    ) -> tuple[TiledSurvey, Sequence[int]]:
+        """Search tiles, then again those whose neighbours report changes; return also tiles that still change.
+
+        The search begins with all tiles, or with those that are `due`.
+        """
+        tiled, left = self, range(len(self.tiles)) if due is None else due
         for _ in range(_MOST_SWEEPS):
-            tiled = tiled.search(work, left, each, tell)
-            left = tiled.changes()
             if not left:
                 break
+            tiled = tiled.search(work, left, each, tell)
+            left = tiled.changes()
         return tiled, left
 
     def with_sources(self, sources: Sources) -> TiledSurvey:
@@ -202,7 +207,7 @@ class TiledSurvey:
         )
         change = new.with_more(Sources(gone.position_m, -gone.moment_Am2))
         field = field_at_points(self._places(tile)[tile.own], change.position_m, change.moment_Am2)
-        return bool(np.linalg.norm(field, axis=1).max() > _CHANGED * self.array.channel_noise_T.min())
+        return bool(np.linalg.norm(field, axis=1).max() > _CHANGED * white_noise_T(self.array).min())
 
     def _richest(self) -> int:
         """Return the tile with most sources, which determines common parameters best."""
@@ -253,9 +258,7 @@ class TiledSurvey:
             lag = estimate_lag(piece_at)
         if not lag.s:
             return self, lag
-        nothing = [Sources.none()] * len(self.tiles)
-        unknown = replace(self, sources=Sources.none(), found=nothing, known=nothing, outside=nothing)
-        return replace(unknown, readings=track.with_earlier_poses(lag.s)), lag
+        return replace(self._without_sources(), readings=track.with_earlier_poses(lag.s)), lag
 
     def with_likeliest_pose(self) -> TiledSurvey:
         """Return the survey with the pose errors estimated from the sources of one tile."""
@@ -265,6 +268,25 @@ class TiledSurvey:
         if not len(fit.sources):
             return self
         return replace(self, array=with_likeliest_pose(model, fit.sources).record.array)
+
+    def with_likeliest_offsets(self) -> TiledSurvey:
+        """Return the survey with heading errors that nobody stated, if it shows some; then its sources are unknown."""
+        piece = self.piece(self._richest())
+        model = piece.model()
+        fit, _ = model.refit(piece.known, piece.groups(model.record, WHILE_SEARCHING * model.nearest_m))
+        array = with_likeliest_offsets(model, fit.sources).record.array
+        if array is self.array:
+            return self
+        size_nT = max(1e9 * sensor.offset_uncertainty_T for sensor in array.sensors)
+        _LOG.warning(
+            "the readings change with the attitude, as by heading errors of the sensors: taken into account. State"
+            f" offset_uncertainty_nT = {size_nT:.2g}"
+        )
+        return replace(self._without_sources(), array=array)
+
+    def _without_sources(self) -> TiledSurvey:
+        nothing = [Sources.none()] * len(self.tiles)
+        return replace(self, sources=Sources.none(), found=nothing, known=nothing, outside=nothing)
 
     def map_tiles(self, work: Work, each: Each, tell: Tell) -> list[Arrays]:
         """Return the results of some work on every tile."""

@@ -22,6 +22,7 @@ from magloc.least_squares import damped_step, minimise
 from magloc.measurement.pose import PoseErrors
 from magloc.surveying.fit.kernels import MeasuredRows
 from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.sensor_noise import white_noise_T
 from magloc.surveying.fit.whitening import RecordWhitening, SurveyDrift
 from magloc.terrain.surface import FLAT, Terrain
 
@@ -157,7 +158,7 @@ class SurveyBackground:
         fields = sources.fields(record)
         gradients = record.gradients(sources.position_m, sources.moment_Am2)
         directions = record.directions(fields)
-        least_T = _NEGLIGIBLE * float(record.array.channel_noise_T.min())
+        least_T = _NEGLIGIBLE * float(white_noise_T(record.array).min())
         near = sources.with_more(beside)
         where = directions, near.position_m, near.moment_Am2
         size = _BESIDE_SHARE * np.repeat(np.linalg.norm(beside.moment_Am2, axis=1)[:, None], 6, axis=1)

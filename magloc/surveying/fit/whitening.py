@@ -16,10 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
-from magloc.measurement.nuisances import without_lasting_errors
 from magloc.measurement.pose import SHIFT, PoseErrors
 from magloc.surveying.fit.kernels import MeasuredRows, WhiteningFilter
 from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.sensor_noise import white_noise_T
 
 OFFSET_T = 1e-6
 """Initial standard deviation of a sensor's offset."""
@@ -177,7 +177,7 @@ def independent_measurements(record: SurveyRecord) -> FloatArray:
 
     The directions that attitude errors change are projected out.
     """
-    sigma = without_lasting_errors(record.array).channel_noise_T
+    sigma = white_noise_T(record.array)
     unit = record.ambient_T.mean(axis=0)
     unit = unit / np.linalg.norm(unit)
     across = np.linalg.svd(unit[None])[2][1:]

@@ -183,7 +183,7 @@ class TestHostileWorld:
     def test_more_noise_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
         field, rng = simulated("survey-drone", 901), np.random.default_rng(12)
         noise = 20.0 * field.array.channel_noise_T * rng.standard_normal(field.readings.values_T.shape)
-        self.check(replace(field.readings, values_T=field.readings.values_T + noise), caplog, "χ² per reading")
+        self.check(replace(field.readings, values_T=field.readings.values_T + noise), caplog, "times the stated noise")
 
     def test_another_unit(self, caplog: pytest.LogCaptureFixture) -> None:
         readings = simulated("survey-drone", 901).readings
@@ -197,7 +197,7 @@ class TestHostileWorld:
         assert readings.array_rotation is not None
         heading = readings.array_rotation.as_euler("ZYX")[:, 0]
         error = 5e-9 * np.outer(np.cos(heading), [1.0, 0.5])
-        self.check(replace(readings, values_T=readings.values_T + error), caplog, "χ² per reading")
+        self.check(replace(readings, values_T=readings.values_T + error), caplog, "offset_uncertainty_nT")
 
     @pytest.mark.slow
     def test_poses_that_are_worse_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
