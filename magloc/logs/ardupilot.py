@@ -97,9 +97,7 @@ def read_dataflash(path: Path) -> Log:
     if not topics:
         raise InputError(f"{path}: found a DataFlash log without messages, expected logged sensors.")
     warnings = [f"{path}: {index.damaged} parts of the log are damaged or cut; the whole messages are read"]
-    parameters: dict[str, float] = {}
-    if "PARM" in tables:
-        parameters = {_text(row["Name"]): float(row["Value"]) for row in tables["PARM"]}
+    parameters = {_text(row["Name"]): float(row["Value"]) for row in _rows(tables, "PARM", Name="S", Value="f")}
     zero_s = _unix_zero_s(tables)
     return Log(str(path), "ArduPilot DataFlash", tuple(topics), parameters, zero_s, tuple(warnings[: index.damaged]))
 
@@ -155,12 +153,10 @@ def _stated_units(
     tables: dict[str, NDArray[Any]], formats: dict[int, MessageFormat]
 ) -> dict[str, dict[str, LoggedUnit | None]]:
     """Return the units by message and field that the log states; None marks the field with the instance."""
-    if not {"FMTU", "UNIT", "MULT"} <= tables.keys():
-        return {}
-    labels = {chr(row["Id"]): _text(row["Label"]) for row in tables["UNIT"]}
-    sizes = {chr(row["Id"]): float(row["Mult"]) for row in tables["MULT"]}
+    labels = {chr(int(row["Id"]) % 256): _text(row["Label"]) for row in _rows(tables, "UNIT", Id="iu", Label="S")}
+    sizes = {chr(int(row["Id"]) % 256): float(row["Mult"]) for row in _rows(tables, "MULT", Id="iu", Mult="f")}
     found: dict[str, dict[str, LoggedUnit | None]] = {}
-    for row in tables["FMTU"]:
+    for row in _rows(tables, "FMTU", FmtType="iu", UnitIds="S", MultIds="S"):
         of = formats.get(int(row["FmtType"]))
         if of is None:
             continue
@@ -172,6 +168,13 @@ def _stated_units(
             elif (label := labels.get(unit, "")) and label != "UNKNOWN":
                 own[name] = _scaled(label, 1.0 if letter in _SCALES else sizes.get(size, 1.0) or 1.0)
     return found
+
+
+def _rows(tables: dict[str, NDArray[Any]], name: str, **kinds: str) -> list[Any]:
+    """Return the messages of a name; none unless they have fields of some kinds of numbers or text."""
+    table = tables.get(name)
+    known = {} if table is None else {of: table.dtype[of].kind for of in table.dtype.names or ()}
+    return list(table) if table is not None and all(known.get(of, "-") in kind for of, kind in kinds.items()) else []
 
 
 def _scaled(label: str, size: float) -> LoggedUnit:
@@ -211,9 +214,8 @@ def _unit_without(name: str, is_place: bool) -> LoggedUnit | None:
 
 def _unix_zero_s(tables: dict[str, NDArray[Any]]) -> float | None:
     """Return the time since 1970 at the start of the autopilot, by its receiver."""
-    table = tables.get("GPS")
-    if table is None or not {"TimeUS", "GWk", "GMS"} <= set(table.dtype.names or ()) or not table["GWk"].any():
+    row = next((row for row in _rows(tables, "GPS", TimeUS="iu", GWk="iu", GMS="iu") if row["GWk"]), None)
+    if row is None:
         return None
-    row = table[np.flatnonzero(table["GWk"])[0]]
     gps_s = _WEEK_S * float(row["GWk"]) + 1e-3 * float(row["GMS"])
     return _GPS_ZERO_S + gps_s - _LEAP_S - 1e-6 * float(row["TimeUS"])

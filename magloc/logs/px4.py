@@ -76,6 +76,8 @@ def read_ulog(place: Path) -> Log:
 def _topics(message: Any) -> Iterator[Topic]:
     """Yield the topics of a message: one for each clock."""
     columns: dict[str, NDArray[Any]] = dict(message.data)
+    if "timestamp" not in columns:  # its format is damaged
+        return
     name = f"{message.name}[{message.multi_id}]" if message.multi_id else str(message.name)
     stamp = columns.get("timestamp_sample")
     if stamp is None or not stamp.all():

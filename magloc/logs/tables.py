@@ -86,7 +86,7 @@ def read_hdf5(path: Path) -> Log:
     try:
         with h5py.File(path, "r") as file:
             file.visititems(collect)
-    except (OSError, RuntimeError, ValueError):
+    except Exception:  # h5py raises many kinds of errors for damaged files
         raise InputError(f"{path}: found an HDF5 file that cannot be read, expected a whole one.") from None
     topics = tuple(_topic(group, fields, units[group]) for (group, _), fields in groups.items())
     if not topics:

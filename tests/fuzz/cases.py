@@ -24,6 +24,7 @@ from magloc.readings import write_readings
 from sims.experiments.loads import switching_loads
 from tests.adcs.stars.test_identification import random_sky, write_frames
 from tests.magloc.compensation.flights import Flight, Platform, array_of
+from tests.robot_flights import Flight as RobotFlight
 
 APPS = {"magloc": magloc_app, "adcs": adcs_app}
 MAINS = {"magloc": magloc_main, "adcs": adcs_main}
@@ -96,7 +97,12 @@ LINES: dict[str, tuple[str, ...]] = {
         "map --html out.html",
     ),
     "magloc new-array": ("out.toml --shape tetrahedron --size-m 1.5 --noise-nT 1",),
-    "magloc columns": ("readings.csv", "readings.csv --out out.toml", "magarrow.csv --instrument magarrow"),
+    "magloc columns": (
+        "readings.csv",
+        "readings.csv --out out.toml",
+        "magarrow.csv --instrument magarrow",
+        "robot.ulg --out out.toml",
+    ),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
     "adcs demo": ("out",),
@@ -126,7 +132,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "imu.csv --config imu.toml --html out.html",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
-    "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
+    "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out", "robot.ulg --json"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": (
         "frames --catalogue stars.csv --json",
@@ -332,6 +338,7 @@ def write_files(folder: Path) -> None:
     with (folder / "sources.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --sources 1 --json")
     _write_log(folder)
+    (folder / "robot.ulg").write_bytes(RobotFlight(duration_s=3.0).px4())
     _write_magarrow(folder)
     rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
