@@ -19,8 +19,12 @@ from adcs.io.ccsds import write_oem as write_oem
 from adcs.io.imu_files import read_imu as read_imu
 from adcs.io.scenario_files import read_scenario as read_scenario
 from adcs.io.telemetry_files import read_telemetry as read_telemetry
+from adcs.io.vehicle_logs import read_vehicle as read_vehicle
 from adcs.kalman.bank import EstimatorSettings as EstimatorSettings
 from adcs.kalman.bank import estimate as estimate
+from adcs.log_calibration.calibrate import LogCalibration as LogCalibration
+from adcs.log_calibration.calibrate import calibrate_log as calibrate_log
+from adcs.log_calibration.record import VehicleLog as VehicleLog
 from adcs.satellite.attitude_track import AttitudeTrack as AttitudeTrack
 from adcs.satellite.magnetic_control import BDot as BDot
 from adcs.satellite.magnetic_control import HysteresisRods as HysteresisRods

@@ -31,6 +31,8 @@ EXPLAINED = {
     " arrays.cross arrays.cube arrays.hexagon arrays.axial arrays.grid arrays.mesh_of",
     "reading-data": "magloc.read_readings magloc.Readings magloc.read_truth magloc.Truth arrays.InputError"
     " arrays.LogColumns arrays.ValidRows",
+    "drone-compass": "adcs.calibrate_log adcs.LogCalibration adcs.read_vehicle adcs.VehicleLog sims.FlightSettings"
+    " sims.simulate_flight",
     "robot-logs": "magloc.read_log magloc.Log magloc.LogChannel",
     "stated-uncertainty": "arrays.PoseUncertainty",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"

@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "AttitudeScenario": "sims.attitude.scenario",
         "CameraErrors": "sims.mockup.table_run",
+        "FlightSettings": "sims.attitude.flights",
         "MagneticScenario": "sims.magnetics.scenario",
         "TableScenario": "sims.mockup.table_run",
         "experiments": ":sims.experiments",
@@ -14,6 +15,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "rendered_frame": "sims.mockup.frames",
         "run_many": "sims.montecarlo",
         "simulate": "sims.scenarios",
+        "simulate_flight": "sims.attitude.flights",
         "table_run": "sims.mockup.table_run",
         "write_simulation": "sims.magnetics.files",
     },

@@ -16,6 +16,11 @@ COMMANDS = (
     ("tables", "sims.cli.tables:tables", "Repeat Tables 3 to 5 of Ivanov et al. (2014)."),
     ("estimate", "adcs.cli.estimate:estimate", "Estimate attitude and rate from telemetry."),
     ("calibrate", "adcs.cli.calibrate:calibrate", "Calibrate a magnetometer by the field along the orbit."),
+    (
+        "calibrate-log",
+        "adcs.cli.calibrate_log:calibrate_log",
+        "Calibrate the compass of a drone or robot from a flight or drive.",
+    ),
     ("loads", "adcs.cli.loads:loads", "Find the fields and places of loads that switch on board."),
     ("vectors", "adcs.cli.vectors:vectors", "Compute the attitude of every row from field and Sun (TRIAD, QUEST)."),
     ("imu", "adcs.cli.imu:imu", "Estimate the attitude of an inertial unit with a magnetometer."),

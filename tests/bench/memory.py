@@ -83,6 +83,7 @@ CASES = {
     "adcs view": Case("telemetry.csv --config scenario.toml --html out.html", 200, **_SATELLITE),
     "adcs loads": Case("loads.csv --array loads.toml", 3000, files=("loads.csv",)),
     "adcs imu": Case("imu.csv --config imu.toml", 3000, files=("imu.csv",)),
+    "adcs calibrate-log": Case("imu.csv --config imu.toml --out out.toml", 3000, files=("imu.csv",)),
     "adcs stars": Case("frames --catalogue stars.csv", 10, "frame", files=("frames/input.csv", "frames/result.csv")),
     "adcs demo": Case("out"),
     "adcs warm-up": Case(""),

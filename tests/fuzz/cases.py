@@ -133,6 +133,10 @@ LINES: dict[str, tuple[str, ...]] = {
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out", "robot.ulg --json"),
+    "adcs calibrate-log": (
+        "imu.csv --config imu.toml --out out.toml --json",
+        "imu.csv --place 48 11 500 --date 2026-05-01 --out out.params",
+    ),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": (
         "frames --catalogue stars.csv --json",

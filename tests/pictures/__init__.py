@@ -235,6 +235,7 @@ PICTURES: dict[str, Picture] = {
     "residuals-faulty.png": OfPage("sensor-faults", ("magloc/plots/localization.py", STYLE)),
     "hall-board.png": OfPage("hall-board", ("magloc/plots/tracks.py", STYLE)),
     "compensation.png": OfPage("compensation", ("magloc/plots/compensations.py", STYLE)),
+    "drone-compass.png": OfPage("drone-compass", ("adcs/plots/vehicle_calibration.py", STYLE)),
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),

@@ -1,0 +1,1 @@
+"""Calibration of magnetometers, gyro and accelerometer from an ordinary flight or drive."""

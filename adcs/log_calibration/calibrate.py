@@ -1,0 +1,257 @@
+"""Calibration of all sensors of a log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.log_calibration.fit import LogFit, fit_log
+from adcs.log_calibration.manoeuvres import PLACE, advice
+from adcs.log_calibration.parameters import FieldPrior
+from adcs.log_calibration.record import VehicleLog
+from adcs.log_calibration.rotations import nearest_rotation
+from adcs.log_calibration.terms import Terms, soft_iron, terms_of
+from arrays.array import SensorArray
+from arrays.io.results import Drawn
+from arrays.io.tables import align, by_sigma
+from arrays.sensor import Calibration, Sensor
+from arrays.typing import FloatArray
+
+MODEL_ERROR_T = 150e-9
+"""Standard deviation of a component of the geomagnetic model: crust and storms."""
+_LARGEST_FIELD_T = 70e-6
+_TURNED_DEG = 20.0
+_LARGE_SOFT_IRON = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class LogCalibration(Drawn):
+    """Calibration of the sensors of a log.
+
+    Attributes
+    ----------
+    log : VehicleLog
+    fit : LogFit
+    terms : Terms
+    manoeuvres : tuple of str
+        Manoeuvre that would determine each term; empty where the log does.
+    flags : tuple of str
+        Sentences on doubts.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> import sims
+    >>> flight = sims.simulate_flight(1, sims.FlightSettings(duration_s=30.0, inertial_Hz=50.0))
+    >>> found = adcs.calibrate_log(flight.log)
+    >>> "mag0 scale" in found.undetermined  # neither place nor date is known
+    True
+    """
+
+    figure: ClassVar[str] = "adcs.plots.vehicle_calibration:log_calibration_figure"
+    log: VehicleLog
+    fit: LogFit
+    terms: Terms
+    manoeuvres: tuple[str, ...]
+    flags: tuple[str, ...]
+
+    @property
+    def undetermined(self) -> list[str]:
+        """Names of the terms that the log does not determine."""
+        return [name for name, known in zip(self.terms.names, self.terms.determined, strict=True) if not known]
+
+    def is_determined(self, magnetometer: str, *kinds: str) -> bool:
+        """Return True if all terms of some kinds of a magnetometer are determined."""
+        terms = self.terms
+        own = [
+            known
+            for name, kind, known in zip(terms.names, terms.kinds, terms.determined, strict=True)
+            if name.startswith(f"{magnetometer} ") and kind in kinds
+        ]
+        return all(own)
+
+    def matrix(self, m: int) -> FloatArray:
+        """Return the matrix (3, 3) of a magnetometer: reading = matrix · field in body axes + offset."""
+        return self.fit.estimate.parameters[self.fit.estimate.problem.layout.matrix(m)].reshape(3, 3)
+
+    def offset_T(self, m: int) -> FloatArray:
+        """Return the offset (3,) of a magnetometer."""
+        return 1e-6 * self.fit.estimate.parameters[self.fit.estimate.problem.layout.offset(m)]
+
+    def current_T(self, m: int) -> FloatArray:
+        """Return the fields (J, 3) of the unit of each current at a magnetometer."""
+        return 1e-6 * self.fit.estimate.parameters[self.fit.estimate.problem.layout.current(m)].reshape(-1, 3)
+
+    def corrected_T(self, m: int) -> FloatArray:
+        """Return the calibrated readings (n, 3) of a magnetometer during the inertial readings, body axes."""
+        rows = self.fit.estimate.sensor_rows(m, all_rows=True)
+        raw = 1e-6 * self.fit.estimate.problem.magnetometers[m].values[rows.which]
+        raw = raw - self.offset_T(m) - rows.current @ self.current_T(m)
+        return np.asarray(raw @ np.linalg.inv(self.matrix(m)).T)
+
+    def array(self) -> SensorArray:
+        """Return the magnetometers as an array in body axes, with their calibration."""
+        noise = self.fit.estimate.problem.noise.white_uT
+        sensors = []
+        for m, series in enumerate(self.log.magnetometers):
+            scale = tuple(tuple(float(x) for x in row) for row in self.matrix(m))
+            x, y, z = (float(one) for one in self.offset_T(m))
+            calibration = Calibration(scale, (x, y, z))
+            noise_T = 1e-6 * float(noise[m])
+            sensors.append(Sensor(series.name, "vector", (0.0, 0.0, 0.0), noise_T, calibration=calibration))
+        # The array file of a single sensor states how large the field common to all sensors may be.
+        return SensorArray(tuple(sensors), common_field_T=_LARGEST_FIELD_T if len(sensors) == 1 else None)
+
+    @property
+    def entries(self) -> list[dict[str, Any]]:
+        """Terms: name, value, sigma, unit, determined, manoeuvre."""
+        terms = self.terms
+        return [
+            {
+                "name": name,
+                "value": float(value),
+                "sigma": float(sigma),
+                "unit": unit,
+                "determined": bool(known),
+                "manoeuvre": words or None,
+            }
+            for name, value, sigma, unit, known, words in zip(
+                terms.names, terms.values, terms.sigma, terms.units, terms.determined, self.manoeuvres, strict=True
+            )
+        ]
+
+    def report(self) -> dict[str, Any]:
+        """Return the JSON object that ``adcs calibrate-log --json`` prints."""
+        estimate = self.fit.estimate
+        modulus, down = np.linalg.norm(estimate.field_uT[0]), -estimate.field_uT[0][2]
+        return {
+            "terms": self.entries,
+            "undetermined": self.undetermined,
+            "flags": list(self.flags),
+            "field_nT": 1e3 * float(modulus),
+            "inclination_deg": math.degrees(math.asin(down / modulus)),
+            "duration_s": float(np.ptp(self.log.time_s)),
+            "magnetometers": [
+                {
+                    "id": series.name,
+                    "rotation": nearest_rotation(self.fit.mountings[m].T)[1],
+                    "residual_nT": 1e3 * float(np.sqrt(np.mean(estimate.rows[m].residual ** 2))),
+                    "rows": len(series.time_s),
+                    "rows_used": len(estimate.rows[m].which),
+                }
+                for m, series in enumerate(estimate.problem.magnetometers)
+            ],
+        }
+
+    def table(self) -> str:
+        """Return the terms with σ as text; those that are not determined come last, with their manoeuvre."""
+        rows = [["term", "value", "σ", "unit"]]
+        missing: dict[str, list[str]] = {}
+        for entry in self.entries:
+            if entry["determined"]:
+                rows.append([entry["name"], *by_sigma(entry["value"], entry["sigma"]), entry["unit"]])
+            else:
+                missing.setdefault(str(entry["manoeuvre"]), []).append(f"{entry['name']} (σ {entry['sigma']:.2g})")
+        lines = align(rows, left=1) if len(rows) > 1 else []
+        for manoeuvre, names in missing.items():
+            lines += [f"not determined: {', '.join(names)}", f"  to determine: {manoeuvre}"]
+        return "\n".join(lines)
+
+
+def calibrate_log(
+    log: VehicleLog, *, field_T: ArrayLike | None = None, field_error_T: float = MODEL_ERROR_T
+) -> LogCalibration:
+    """Calibrate magnetometers, gyro and accelerometer jointly from a flight or drive.
+
+    The attitude is that of the gyro, whose bias, scales and axes are estimated; the accelerometer holds the tilt, and
+    accelerations of the vehicle are unknown. The magnetometers turn in a field that is constant in the world. Their
+    noise, slow errors and the random walk of the attitude are those of the largest likelihood. Parts of the log that
+    fit none of it are left out and flagged.
+
+    Parameters
+    ----------
+    log : VehicleLog
+        Readings of the vehicle.
+    field_T : array_like, shape (3,), optional
+        Field of the Earth at the place of the log: east, north, up. Without it the scale is not determined.
+    field_error_T : float
+        Standard deviation of a component of this field.
+
+    Returns
+    -------
+    LogCalibration
+        Terms with σ, those that are not determined, and doubts.
+
+    Raises
+    ------
+    ValueError
+        The field has another shape, or a magnetometer has fewer than ten readings during the inertial readings.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> import sims
+    >>> flight = sims.simulate_flight(2, sims.FlightSettings(duration_s=30.0, inertial_Hz=50.0))
+    >>> found = adcs.calibrate_log(flight.log, field_T=sims.FlightSettings().field_T)
+    >>> bool(abs(found.current_T(0) - flight.current_T_A).max() < 20e-9)
+    True
+    """
+    if field_T is not None and np.shape(field_T) != (3,):
+        raise ValueError(f"Input field_T must have shape (3,); instead received {np.shape(field_T)}.")
+    field = FieldPrior() if field_T is None else FieldPrior.of(np.asarray(field_T, np.float64), field_error_T)
+    fit = fit_log(log, field)
+    problem = fit.estimate.problem
+    ranges = np.array([max(float(np.ptp(one.values)), 1e-6) for one in problem.currents])
+    terms = terms_of(
+        problem.layout,
+        fit.estimate.parameters,
+        fit.solution.covariance,
+        problem.prior_sigma,
+        fit.mountings,
+        field,
+        ranges,
+    )
+    return LogCalibration(log, fit, terms, tuple(advice(fit, terms)), tuple(_flags(log, fit)))
+
+
+def _flags(log: VehicleLog, fit: LogFit) -> Iterator[str]:
+    """Yield sentences on doubts."""
+    estimate, data = fit.estimate, fit.estimate.problem.inertial
+    if not fit.converged:
+        yield "the fit did not converge: the terms are not valid"
+    if not estimate.problem.field.is_known:
+        yield f"the modulus of the field is not known, so neither is the scale: {PLACE}"
+    for m, series in enumerate(estimate.problem.magnetometers):
+        name = series.name
+        matrix = estimate.parameters[estimate.problem.layout.matrix(m)].reshape(3, 3)
+        _, symmetric, turn = soft_iron(matrix, fit.mountings[m])
+        number, word = nearest_rotation(fit.mountings[m].T)
+        if number:
+            yield (
+                f"{name} is turned against the gyro by {word}: set CAL_MAG{m}_ROT = {number} (PX4) or"
+                f" COMPASS_ORIENT{m + 1 if m else ''} = {number} (ArduPilot)"
+            )
+        angle = math.degrees(float(np.linalg.norm(turn)))
+        if angle > _TURNED_DEG:
+            yield f"{name} is turned by {angle:.0f}° against the nearest usual mounting"
+        if np.abs(symmetric - np.eye(3)).max() > _LARGE_SOFT_IRON:
+            yield f"{name} has soft iron of more than {100.0 * _LARGE_SOFT_IRON:.0f} %: check its unit and its axes"
+        parts = _parts(fit.disturbed[m])
+        for begin, end in parts[:3]:
+            at = data.time_s[data.knots[[begin, end]]]
+            yield f"{name} is disturbed from {at[0]:.1f} to {at[1]:.1f} s, as by a magnet nearby; this part is left out"
+        if len(parts) > 3:
+            yield f"{name} is disturbed in {len(parts) - 3} further parts of the log, which are left out"
+    if data.in_gap.any():
+        yield f"gyro or accelerometer have gaps in {int(data.in_gap.sum())} intervals of {data.span_s[0]:.1f} s"
+
+
+def _parts(mask: Any) -> list[tuple[int, int]]:
+    """Return first and last knot of each run of marked intervals."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]

@@ -1,0 +1,159 @@
+"""Readings of a vehicle: inertial unit, magnetometers and currents, each with its own clock rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adcs.complementary.inertial.gaps import sensor_gaps
+from adcs.satellite.vector_record import GyroSamples, step_rates, steps_s
+from arrays.typing import BoolArray, FloatArray, IntArray
+
+SHORTEST_S = 2.0
+_KNOT_S, _MOST_KNOTS = 2.0, 1500
+_LONGEST_GAP_S = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Samples of one channel.
+
+    Attributes
+    ----------
+    name : str
+    time_s : ndarray, shape (n,)
+        Ascending times, on the clock of the inertial unit.
+    values : ndarray, shape (n,) or (n, 3)
+        A current or throttle, or the field of a magnetometer [T].
+    device_id : int
+        Identifier of the sensor in the autopilot; 0 if unknown.
+    """
+
+    name: str
+    time_s: FloatArray
+    values: FloatArray
+    device_id: int = 0
+
+    def finite(self) -> Series:
+        """Return the series without missing samples and without samples that are not later than the one before."""
+        read = np.isfinite(self.values.reshape(len(self.values), -1)).all(axis=1) & np.isfinite(self.time_s)
+        times, values = self.time_s[read], self.values[read]
+        later = np.concatenate([[True], times[1:] > np.maximum.accumulate(times)[:-1]]) if len(times) else read[:0]
+        return Series(self.name, times[later], values[later], self.device_id)
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleLog:
+    """Readings of a vehicle, SI units and body axes, NaN where missing.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Ascending times of the inertial unit.
+    gyro_rad_s, acceleration_m_s2 : ndarray, shape (n, 3)
+        Rates and specific force; at rest the acceleration points upwards.
+    magnetometers : tuple of Series
+        Fields [T] of one magnetometer or more.
+    currents : tuple of Series
+        Currents or throttles whose fields are estimated.
+    gyro_samples : str
+        Kind of the gyro's samples, as in :func:`adcs.complementary_filter`.
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, times do not ascend, a gyro or accelerometer or magnetometer is missing, or the log is
+        shorter than 2 s.
+
+    Examples
+    --------
+    >>> import sims
+    >>> log = sims.simulate_flight(1, sims.FlightSettings(duration_s=5.0, magnetometers=2)).log
+    >>> [magnetometer.name for magnetometer in log.magnetometers]
+    ['mag0', 'mag1']
+    """
+
+    time_s: FloatArray
+    gyro_rad_s: FloatArray
+    acceleration_m_s2: FloatArray
+    magnetometers: tuple[Series, ...]
+    currents: tuple[Series, ...] = ()
+    gyro_samples: GyroSamples = "mean"
+
+    def __post_init__(self) -> None:
+        """Check the readings."""
+        n = len(self.time_s)
+        for name, values in (("gyro_rad_s", self.gyro_rad_s), ("acceleration_m_s2", self.acceleration_m_s2)):
+            if values.shape != (n, 3):
+                raise ValueError(f"Input {name} must have shape ({n}, 3); instead received {values.shape}.")
+            if np.isfinite(values).all(axis=1).sum() < 2:
+                raise ValueError(f"Input {name} must have two readings at least; instead received fewer.")
+        steps_s(self.time_s)
+        if np.ptp(self.time_s) < SHORTEST_S:
+            raise ValueError(
+                f"Input time_s must span {SHORTEST_S:g} s at least; instead received {np.ptp(self.time_s):.3g} s."
+            )
+        if not self.magnetometers:
+            raise ValueError("Input magnetometers must name one magnetometer at least; instead received none.")
+
+
+@dataclass(frozen=True, eq=False)
+class InertialData:
+    """Inertial readings between knots, as the estimator uses them.
+
+    Attributes
+    ----------
+    time_s, dt_s : ndarray, shape (n,)
+    rate_rad_s : ndarray, shape (n, 3)
+        Mean rate over the step that ends at each instant.
+    acceleration_m_s2 : ndarray, shape (n, 3)
+        Specific force, without missing samples.
+    knots : ndarray of int, shape (K,)
+        Instants of the knots; the first and the last instant are knots.
+    in_gap : ndarray of bool, shape (K - 1,)
+        Intervals in which the gyro has a gap.
+    """
+
+    time_s: FloatArray
+    dt_s: FloatArray
+    rate_rad_s: FloatArray
+    acceleration_m_s2: FloatArray
+    knots: IntArray
+    in_gap: BoolArray
+
+    @classmethod
+    def of(cls, log: VehicleLog) -> InertialData:
+        """Return the inertial readings of a log from the gyro's first reading to its last."""
+        read = np.asarray(np.isfinite(log.gyro_rad_s).all(axis=1))
+        first, last = int(np.argmax(read)), len(read) - int(np.argmax(read[::-1]))
+        piece = slice(first, last)
+        times, gyro, force = log.time_s[piece], log.gyro_rad_s[piece], log.acceleration_m_s2[piece]
+        dt = steps_s(times)
+        rate = step_rates(gyro, dt, log.gyro_samples)
+        known = np.asarray(np.isfinite(force).all(axis=1))
+        whole = np.stack([np.interp(times, times[known], axis[known]) for axis in force.T], axis=1)
+        length = max(_KNOT_S, np.ptp(times) / _MOST_KNOTS)
+        at = times[0] + length * np.arange(1, int(np.ptp(times) / length))
+        knots = np.unique(np.concatenate([[0], np.searchsorted(times, at), [len(times) - 1]]))
+        in_gap = np.zeros(len(knots) - 1, np.bool_)
+        for gaps in (sensor_gaps(times, read[piece], _LONGEST_GAP_S), sensor_gaps(times, known, _LONGEST_GAP_S)):
+            for before, after in gaps:
+                in_gap[np.searchsorted(knots, before, "right") - 1 : np.searchsorted(knots, after, "left")] = True
+        return cls(times, dt, rate, whole, knots, in_gap)
+
+    @property
+    def span_s(self) -> FloatArray:
+        """Lengths (K - 1,) of the intervals."""
+        return np.diff(self.time_s[self.knots])
+
+    @property
+    def interval(self) -> IntArray:
+        """Interval (n,) of each instant; the last instant belongs to the last one."""
+        of = np.searchsorted(self.knots, np.arange(len(self.time_s)), "right") - 1
+        return np.minimum(of, len(self.knots) - 2)
+
+    def part(self, time_s: FloatArray, interval: IntArray) -> FloatArray:
+        """Return the elapsed part of the interval at some times, 0 to 1."""
+        begin, end = self.time_s[self.knots[interval]], self.time_s[self.knots[interval + 1]]
+        return (time_s - begin) / (end - begin)

@@ -1,0 +1,107 @@
+"""Logs of vehicles: CSV files, and binary logs of autopilots."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import adcs
+import arrays
+from sims.attitude.flights import FlightSettings, simulate_flight
+from tests.adcs.log_calibration.flights import write_flight
+from tests.written_logs import ulog
+
+FLIGHT = simulate_flight(2, FlightSettings(duration_s=30.0, magnetometers=2))
+
+
+def px4_log(path, *, magnetometer="sensor_mag"):
+    """Write a flight as PX4 logs it; places in 1e-7 degrees."""
+    log = FLIGHT.log
+    stamp = (1e6 * log.time_s + 5e6).astype("u8")
+    topics = [
+        (
+            "sensor_combined",
+            0,
+            {
+                "timestamp": stamp,
+                "gyro_rad": log.gyro_rad_s.astype("f4"),
+                "accelerometer_timestamp_relative": np.zeros(len(stamp), "i4"),
+                "accelerometer_m_s2": log.acceleration_m_s2.astype("f4"),
+            },
+        ),
+        ("battery_status", 0, {"timestamp": stamp[::10], "current_a": log.currents[0].values[::10].astype("f4")}),
+        (
+            "vehicle_gps_position",
+            0,
+            {
+                "timestamp": stamp[::100],
+                "time_utc_usec": stamp[::100] + np.uint64(1_700_000_000_000_000),
+                "lat": np.full(len(stamp[::100]), 473_000_000, "i4"),
+                "lon": np.full(len(stamp[::100]), 85_000_000, "i4"),
+                "alt": np.full(len(stamp[::100]), 500_000, "i4"),
+                "fix_type": np.full(len(stamp[::100]), 3, "u1"),
+            },
+        ),
+    ]
+    for m, series in enumerate(log.magnetometers):
+        gauss = 1e4 * series.values
+        at = (1e6 * series.time_s + 5e6).astype("u8")
+        if magnetometer == "sensor_mag":
+            columns = {axis: gauss[:, i].astype("f4") for i, axis in enumerate("xyz")}
+            device = {"device_id": np.full(len(at), 100 + m, "u4")}
+            topics.append(("sensor_mag", m, {"timestamp": at, **device, **columns}))
+        elif magnetometer == "vehicle_magnetometer" and m == 0:
+            topics.append(("vehicle_magnetometer", 0, {"timestamp": at, "magnetometer_ga": gauss.astype("f4")}))
+    path.write_bytes(ulog(topics))
+    return path
+
+
+class TestText:
+    def test_magnetometers_and_currents_by_their_units(self, tmp_path):
+        write_flight(FLIGHT, tmp_path / "log.csv")
+        file = adcs.read_vehicle(tmp_path / "log.csv")
+        assert [one.name for one in file.log.magnetometers] == ["field", "mag1"]
+        assert [one.name for one in file.log.currents] == ["battery_A"]
+        np.testing.assert_allclose(file.log.currents[0].values, FLIGHT.log.currents[0].values)
+        read = file.log.magnetometers[1].finite().values
+        np.testing.assert_allclose(read, FLIGHT.log.magnetometers[1].values[: len(read)], atol=1e-13)
+        assert file.place is None
+
+    def test_named_current_that_is_missing(self, tmp_path):
+        write_flight(FLIGHT, tmp_path / "log.csv")
+        with pytest.raises(arrays.InputError, match=r"the nearest is battery_A"):
+            adcs.read_vehicle(tmp_path / "log.csv", None, ["batery_A"])
+
+    def test_log_without_magnetometer(self, tmp_path):
+        flight = replace(FLIGHT, log=replace(FLIGHT.log))
+        write_flight(flight, tmp_path / "log.csv")
+        lines = (tmp_path / "log.csv").read_text().splitlines()
+        (tmp_path / "bare.csv").write_text("\n".join(",".join(line.split(",")[:7]) for line in lines))
+        with pytest.raises(arrays.InputError, match="one magnetometer"):
+            adcs.read_vehicle(tmp_path / "bare.csv")
+
+
+class TestPx4:
+    def test_sensors_place_and_date(self, tmp_path):
+        file = adcs.read_vehicle(px4_log(tmp_path / "log.ulg"))
+        assert [one.name for one in file.log.magnetometers] == ["sensor_mag", "sensor_mag[1]"]
+        assert [one.device_id for one in file.log.magnetometers] == [100, 101]
+        np.testing.assert_allclose(file.log.magnetometers[0].values, FLIGHT.log.magnetometers[0].values, atol=1e-11)
+        np.testing.assert_allclose(file.log.acceleration_m_s2, FLIGHT.log.acceleration_m_s2, atol=1e-5)
+        assert [one.name for one in file.log.currents] == ["battery_status.current_a"]
+        assert file.place == pytest.approx((47.3, 8.5, 500.0))
+        assert file.date == "2023-11-14"
+        assert not file.is_corrected
+
+    def test_corrected_fields_are_named(self, tmp_path):
+        file = adcs.read_vehicle(px4_log(tmp_path / "log.ulg", magnetometer="vehicle_magnetometer"))
+        assert file.is_corrected
+        assert "adds to its parameters" in file.warnings[0]
+
+    def test_no_magnetometer(self, tmp_path):
+        with pytest.raises(arrays.InputError, match="found no readings of a magnetometer"):
+            adcs.read_vehicle(px4_log(tmp_path / "log.ulg", magnetometer="none"))
+
+    def test_layout_is_refused(self, tmp_path):
+        with pytest.raises(arrays.InputError, match="binary log with a layout"):
+            adcs.read_vehicle(px4_log(tmp_path / "log.ulg"), tmp_path / "log.toml")
