@@ -14,6 +14,7 @@ from tests.fuzz.cases import LINES, MAINS, SELDOM, STREAM
 
 FULL = Path("/dev/full")
 COMMANDS = [pytest.param(name, marks=[pytest.mark.slow] if name in SELDOM else []) for name in LINES]
+PRINTING_NOTHING = {"magloc new-array", "magloc view", "adcs view"}
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 
 
@@ -35,15 +36,9 @@ def run(command, words, stdout):
 @needs_full
 @pytest.mark.parametrize("command", COMMANDS)
 def test_full_standard_output(command, folder):
-    """Where a command prints nothing, nothing is wrong."""
-    words = LINES[command][0].split()
-    printed = io.StringIO()
-    assert run(command, words, printed)[0] == 0
-    shutil.rmtree(folder / "out", ignore_errors=True)
-    sys.stdin.seek(0)
     with FULL.open("w") as full:
-        status, err = run(command, words, full)
-    if not printed.getvalue():
+        status, err = run(command, LINES[command][0].split(), full)
+    if command in PRINTING_NOTHING:
         assert status == 0
     else:
         assert (status, err.splitlines()[-1]) == (

@@ -14,10 +14,8 @@ STORED = Path(__file__).with_name("figures.json")
 QUICK = (
     "paper",
     "weaving",
-    "first rows, walk",
     "gaps",
     "carrier, vectors",
-    "moduli, ambient exact",
     "known modulus, 8 m",
     "one magnet, auto",
     "stream, first rows",

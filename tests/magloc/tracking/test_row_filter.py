@@ -218,12 +218,15 @@ class TestOneSource:
     @all_instruction_sets
     @pytest.mark.parametrize("array", ARRAYS, ids=["vector", "scalar"])
     @pytest.mark.parametrize(
-        ("pose", "offset_T"),
-        [(None, 0.0), (None, 4e-9), (NEW_IN_EVERY_ROW, 0.0), (WALKING, 4e-9)],
-        ids=["known", "offsets", "white", "walk and offsets"],
+        ("pose", "offset_T", "bends", "seed"),
+        [
+            # In `make test` each two of these come together once.
+            pytest.param(pose, offset_T, bends, seed, marks=[pytest.mark.slow] if (i + bends + seed) % 2 else [])
+            for i, (pose, offset_T) in enumerate([(None, 0.0), (None, 4e-9), (NEW_IN_EVERY_ROW, 0.0), (WALKING, 4e-9)])
+            for bends in (False, True)
+            for seed in range(4)
+        ],
     )
-    @pytest.mark.parametrize("bends", [False, True])
-    @pytest.mark.parametrize("seed", range(4))
     def test_update_is_the_best_fit(
         self, array: SensorArray, seed: int, bends: bool, pose: PoseUncertainty | None, offset_T: float
     ) -> None:

@@ -285,7 +285,7 @@ class TestConsistency:
         assert low < nis.sum() < high
 
     def test_errors_are_as_large_as_stated(self) -> None:
-        self.check(120, 15.0, seed=6)
+        self.check(60, 15.0, seed=6)
 
     @pytest.mark.slow
     def test_errors_are_as_large_as_stated_in_many_long_runs(self) -> None:

@@ -120,6 +120,7 @@ class TestTracks:
 
 
 class TestFirstRow:
+    @pytest.mark.slow
     def test_three_are_told_where_two_hold(self):
         """Two in other places pass every test of this row; three are likelier by far."""
         rng = np.random.default_rng(3)
