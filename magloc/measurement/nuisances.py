@@ -152,6 +152,11 @@ class SensorErrors:
         fields = (self.of_sensor[:, 1] >= _FIELD) & (self.of_sensor[:, 1] < _INDUCED)
         return bool(fields.all() and not self.is_slope.any() and not self.array.channel_is_scalar.any())
 
+    @property
+    def depends_on_field(self) -> bool:
+        """True if an effect is proportional to the field at the sensor, as for gains and rotations."""
+        return bool((self.of_sensor[:, 1] < _FIELD).any())
+
     def step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
         """Return decay factors and added standard deviations, (n,) each, over a time step."""
         kept = np.exp(-self.decay_Hz * dt_s)

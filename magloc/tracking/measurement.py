@@ -19,7 +19,7 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
-from arrays.noise import reading_covariance
+from arrays.noise import mean_of_finite, reading_covariance
 from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
@@ -325,13 +325,20 @@ class RowMeasurements:
         self._n_motion = n_motion
         self._differences: dict[bytes, Differences] = {}
 
-    def of(self, row: Row) -> RowMeasurement:
-        """Return the measurement model of a row."""
+    def of(self, row: Row, source: FloatArray | None = None) -> RowMeasurement:
+        """Return the measurement model of a row.
+
+        Errors of gains and axes act on the field of a source (6,), by default on the readings. Noise of the readings
+        would make them known better than they are: row after row it looks like a field with another gain.
+        """
         array = self._array
         if row.ambient_T is not None:
             array = array.in_ambient_field(row.ambient_T)
         differences, pose = self.differences(row), row.pose(self._lever_arm_m)
-        of_errors = self.errors.effect(array, row.readings_T, row.time_s, pose.rate_rad_s)
+        readings_T = row.readings_T
+        if source is not None and self.errors.depends_on_field:
+            readings_T = _readings_of(array, readings_T, pose.to_array(source))
+        of_errors = self.errors.effect(array, readings_T, row.time_s, pose.rate_rad_s)
         of_pose = self.pose_errors.effect(pose, row.pose_sigma)
         model, effect = DifferenceMeasurement(array, differences), differences.transform @ of_errors
         return RowMeasurement(model, row, self._n_motion, effect, pose, of_pose)
@@ -376,6 +383,14 @@ class Coordinates:
         if np.array_equal(state, self.centre):
             return np.zeros(N_SOURCE), self.J
         return self.M @ (self.function(state) - self.value), self.M @ self.jacobian(state)
+
+
+def _readings_of(array: SensorArray, readings_T: FloatArray, source: FloatArray) -> FloatArray:
+    """Return readings (C,) of a source in the array's frame and of the common field that measured ones (C,) leave."""
+    fields_T = dipole.field(array.positions, source[:3], source[3:]) + array.ambient_fields
+    if array.ambient_T is None:
+        fields_T = fields_T + mean_of_finite(array.calibrated_field(readings_T) - fields_T, axis=-2)
+    return array.readings_of(fields_T)
 
 
 def step_of_errors(pose_errors: PoseErrors, errors: SensorErrors, dt_s: float) -> tuple[FloatArray, FloatArray]:

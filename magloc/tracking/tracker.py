@@ -239,14 +239,17 @@ class Tracker(CartesianFilter):
             row, out, lambda row: math.inf if self.filter.row_mixture(row, self.motion)[0] is None else 0.0
         )
         open_loop = self.prior_covariance(measurement, mixture.x[np.argmax(mixture.log_weight)])
+        if self.errors.depends_on_field:
+            measurement = self._measure(row, out, mixture)
         young = ((measurement, self.motion),) if self.filter.refits(self.motion) else ()
         known = self.filter.refit(TrackState(mixture, open_loop, young=young))
         return out, self._tracked_point(measurement.row, index, known, None, status="acquired")
 
-    def _measure(self, row: Row, out: BoolArray) -> RowMeasurement:
-        """Return the measurement model of a row without some of its sensors (N,)."""
+    def _measure(self, row: Row, out: BoolArray, mixture: Mixture | None = None) -> RowMeasurement:
+        """Return the model of a row without some sensors (N,), whose gains act on a mixture's likeliest source."""
+        source = None if mixture is None else mixture.x[np.argmax(mixture.log_weight), :N_SOURCE]
         readings = np.where(out[self.array.channel_sensor], np.nan, row.readings_T)
-        return self.measurements.of(replace(row, readings_T=readings) if out.any() else row)
+        return self.measurements.of(replace(row, readings_T=readings) if out.any() else row, source)
 
     def _follow_track(self, before: TrackState, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
         """Continue a track by one row; return the sensors (N,) left out, and the point."""
@@ -274,6 +277,11 @@ class Tracker(CartesianFilter):
             measurement = self._measure(row, out)
         else:
             self._suspects = self._suspects.decay(1)
+        if update.mixture is not None and self.errors.depends_on_field:
+            at_source = self._measure(row, out, update.mixture)
+            again = update_by(at_source)
+            if again.mixture is not None:
+                measurement, update = at_source, again
         innovation = Innovation(measurement.row.available, update.innovation, update.correction)
         if update.mixture is None:
             contradictions = before.contradictions + (not may_be_fault)

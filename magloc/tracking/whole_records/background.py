@@ -199,6 +199,9 @@ def _iterate_passes(
     measurements = measurements[begin : begin + len(states)]
     used = np.ones(len(measurements), dtype=bool)
     for _ in range(_MOST_PASSES):
+        if tracker.errors.depends_on_field:
+            sources = (state[:N_SOURCE] for state in states)
+            measurements = [tracker.measurements.of(m.row, at) for m, at in zip(measurements, sources, strict=True)]
         try:
             with np.errstate(all="ignore"):  # passes may overflow
                 passed = _forward_pass(tracker, measurements, begin, states, used)
