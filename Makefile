@@ -11,6 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 NOT_INSTALLED = { echo "magloc could not be installed: it needs the package index, and a C++ compiler (g++, clang++) or else Zig from that index" >&2; exit 1; }
 
+KERNEL_SOURCES := magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
 .PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against validation docs notebooks pictures chromium lint sanitize clean
@@ -39,7 +40,7 @@ style: .venv/installed-test
 
 style-of-kernels: .venv/installed-test
 	$(BIN)/clang-format --dry-run -Werror $$(find magloc adcs docs/examples -name '*.cpp' -o -name '*.hpp' -o -name '*.[ch]')
-	$(BIN)/clang-tidy --quiet magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
+	$(BIN)/clang-tidy --quiet $(KERNEL_SOURCES)
 
 # Tests are compiled once, beside the linters, of which mypy takes as long as all others.
 ready: .venv/installed-test
@@ -48,8 +49,10 @@ ready: .venv/installed-test
 compiled-tests: .venv/installed-test
 	@$(BIN)/python -m pytest -qq --collect-only >/dev/null
 
-# The tests of kernels with address and undefined-behaviour sanitizers, which end the tests at the first fault.
+# Faults of memory: by the analyser of paths, and by the tests of kernels with address and undefined-behaviour
+# sanitizers, which end the tests at the first fault.
 sanitize: .venv/installed-test
+	$(BIN)/clang-tidy --quiet --checks='-*,clang-analyzer-core.*' $(KERNEL_SOURCES)
 	cmake -G Ninja -S magloc/core -B build/sanitize -DMAGLOC_SANITIZE=ON -DPython_EXECUTABLE=$(abspath $(BIN)/python) >/dev/null
 	cmake --build build/sanitize
 	ASAN_OPTIONS=detect_leaks=0 LD_PRELOAD=$$($(CXX) -print-file-name=libasan.so) MAGLOC_KERNELS=$(abspath build/sanitize/kernels.so) \

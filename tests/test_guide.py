@@ -35,6 +35,7 @@ WIDEST = 88
 # Pages, and packages with examples, whose code takes many seconds.
 SLOW = {
     "array-design",
+    "detection-range-and-bounds",
     "drone-log",
     "exporting",
     "field-log",
@@ -45,6 +46,7 @@ SLOW = {
     "sims.experiments",
     "single-sensor-ranging",
     "stated-uncertainty",
+    "tracking",
     "uncertainty",
 }
 PACKAGES = [

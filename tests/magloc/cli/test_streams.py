@@ -26,8 +26,14 @@ def in_shell(arguments: str, streams: str) -> subprocess.CompletedProcess[str]:
 
 
 class TestStreams:
-    @pytest.mark.parametrize("streams", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
-    @pytest.mark.parametrize("arguments", CALLS)
+    @pytest.mark.parametrize(
+        ("arguments", "streams"),
+        [
+            pytest.param(arguments, streams, marks=[pytest.mark.slow] if (i + k) % 2 else [])
+            for i, streams in enumerate((">&-", "2>&-", "<&-", "<&- >&- 2>&-"))
+            for k, arguments in enumerate(CALLS)
+        ],
+    )
     def test_closed(self, arguments: str, streams: str) -> None:
         done = in_shell(arguments, streams)
         assert done.returncode == (2 if arguments == "wrong" else 0)

@@ -142,7 +142,7 @@ class TestOnePassIsTheExactUpdate:
         S = np.diag(np.repeat(s, 3))
         if isinstance(method, RepeatedFilter):
             S = predict(S, np.eye(6), S)
-        starts = starts_of(kind, 25)
+        starts = starts_of(kind, 10)
         ends = method.run(measurement, z, starts)
         compared = 0
         for start, end in zip(starts, ends.states, strict=True):
@@ -200,7 +200,7 @@ class TestReadableTwins:
     def test_whole_runs_from_near_the_source(self, method: Filter, tolerance_T: float) -> None:
         measurement, z = problem(TETRAHEDRON)
         ends = self.compare(
-            replace(method, tolerance_T=tolerance_T), measurement, z, starts_of("source", 20), 1e-6, counts=True
+            replace(method, tolerance_T=tolerance_T), measurement, z, starts_of("source", 8), 1e-6, counts=True
         )
         assert ends.stopped.all()
 

@@ -59,6 +59,7 @@ def test_errors_are_no_larger_than_stated(factor: float) -> None:
     assert total[ZEROS].min() > 0.25 * stats.chi2.ppf(FALSE_ALARM / 2, RUNS)
 
 
+@pytest.mark.slow
 def test_a_walk_alone_would_not_be_honest() -> None:
     """The bounds are narrow enough to tell: without drifts the zeros lag."""
     total = squares(1.0, DelayedFilterSettings(drift_walk_m_s3_rs=1e-15), StartSigma(drift_m_s3=1e-15))
