@@ -22,6 +22,7 @@ from arrays.typing import FloatArray, Vector
 
 _LOG = logging.getLogger(__name__)
 _BEGIN_CHARACTERS = 2**20  # of a log that are read for its origin
+_LEAST_BEYOND = 0.01  # share of rows without a position that is said
 _FEW_ROWS = 20  # whose cells are screened before columns are
 
 
@@ -244,6 +245,14 @@ def _positions_of_track(time_s: FloatArray, columns: LogColumns, track: Track) -
         raise InputError(
             f"{track.path}: found {span}, expected positions from {time_s[0]:.0f} to {time_s[-1]:.0f} s, the times of"
             " the log: state its date (--date), or time_offset_s between both clocks."
+        )
+    if (beyond := np.isfinite(time_s).sum() - len(inside)) > _LEAST_BEYOND * len(time_s):
+        early_s, late_s = fixes[0, 0] - np.nanmin(time_s), np.nanmax(time_s) - fixes[-1, 0]
+        _LOG.warning(
+            f"{track.path}: {beyond} of {len(time_s)} rows of the log have no position: they begin"
+            f" {max(early_s, 0.0):.0f} s before the positions and end {max(late_s, 0.0):.0f} s after them. If both were"
+            " recorded together, their clocks differ: local time by whole hours, GPS time by 18 s ahead of UTC; state"
+            " time_offset_s"
         )
     inside = inside[np.argsort(time_s[inside], kind="stable")]
     after = np.clip(np.searchsorted(time_s[inside], fixes[:, 0]), 1, max(len(inside) - 1, 1))

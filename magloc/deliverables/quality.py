@@ -17,7 +17,7 @@ from arrays.io.results import Result
 from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
-from magloc.grids.work import workers
+from magloc.deliverables.lag import clock_lag, without_ambient
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.measurement.plausibility import EARTH_T, finite_median
 from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
@@ -26,9 +26,8 @@ from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag
 from magloc.surveying.fit.sensor_noise import NOISY, white_noise_T
-from magloc.surveying.piece import Ground, strongest_sources
+from magloc.surveying.piece import Ground
 from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings
-from magloc.surveying.survey import tile_rows
 from magloc.terrain.surface import Terrain
 
 GAP = 3.0
@@ -41,7 +40,6 @@ _NEAR = 0.75  # distance of a covered place from a line, in spacings
 _FOURTH = math.sqrt(70.0)  # standard deviation of the fourth difference of white noise
 _GAUSSIAN = 1.4826  # standard deviation over the median of absolute values
 _CELLS_PER_SPACING, _MOST_CELLS = 10.0, 200_000
-_LAG_HEIGHTS, _LAG_SPACINGS = 10.0, 3.0  # half width of the area from which the lag is estimated
 _SHORTEST_GEOLOGY_M = 15.0
 
 
@@ -343,6 +341,7 @@ def check_quality(
     height_m = -terrain.depth_of(place_m)
     lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
     coverage = _coverage(place_m[:, :2], lines)
+    whole = rows[np.flatnonzero(~unusable.any(axis=1))]
     return Quality(
         array,
         rows.time_s,
@@ -354,8 +353,8 @@ def check_quality(
         unusable & ~stuck & ~spikes,
         stuck,
         spikes,
-        [heading_error(place_m[:, :2], column, lines) for column in _without_ambient(rows, moduli_T).T],
-        _clock_lag(array, rows[np.flatnonzero(~unusable.any(axis=1))], ground, coverage),
+        [heading_error(place_m[:, :2], column, lines) for column in without_ambient(rows, moduli_T).T],
+        None if coverage is None else clock_lag(array, whole, ground, coverage.spacing_m),
         coverage,
         np.array([finite_median(column) for column in moduli_T.T]),
         held,
@@ -384,13 +383,6 @@ def _fourth_differences(time_s: FloatArray, values: FloatArray) -> FloatArray:
 def _spread(values: FloatArray) -> float:
     """Return the standard deviation of Gaussian values with outliers; NaN without any value."""
     return _GAUSSIAN * finite_median(np.abs(values))
-
-
-def _without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
-    """Return the moduli minus the modulus of the ambient field if that is known for every row."""
-    if rows.ambient_T is None:
-        return moduli_T
-    return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
 
 
 def _level_share(rows: Readings) -> float:
@@ -428,22 +420,3 @@ def _dense(xy_m: FloatArray, step_m: float) -> FloatArray:
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
     at = np.linspace(0.0, way[-1], math.ceil(way[-1] / step_m) + 1)
     return np.stack([np.interp(at, way, axis) for axis in xy_m.T], axis=-1)
-
-
-def _clock_lag(array: SensorArray, rows: Readings, ground: Ground, coverage: Coverage | None) -> ClockLag | None:
-    """Return the lag of the rows around the strongest anomaly; None if they show no target."""
-    known = rows.ambient_T is not None or array.ambient_T is not None
-    if coverage is None or len(rows) < FEWEST_ROWS or not (known or not array.channel_is_scalar.any()):
-        return None
-    assert rows.array_position_m is not None
-    moduli = _without_ambient(rows, field_moduli(array, rows.values_T)).mean(axis=1)
-    middle = rows.array_position_m[np.argmax(np.abs(moduli - np.median(moduli)))]
-    height_m = float(np.median(-ground.terrain.depth_of(rows.array_position_m)))
-    half_m = max(_LAG_HEIGHTS * height_m, _LAG_SPACINGS * coverage.spacing_m)
-    near = rows[(np.abs(rows.array_position_m - middle)[:, :2] < half_m).all(axis=1)]
-    if len(near) < FEWEST_ROWS:
-        return None
-    tiled = tile_rows(array, near, ground)
-    with workers(1, None, None) as each:
-        tiled, _ = tiled.settle(strongest_sources, each, lambda _: None)
-    return tiled.correct_lag(array.pose is None and rows.pose_sigma is None)[1] if len(tiled.sources) else None

@@ -24,6 +24,7 @@ _STEP_M = 0.05  # step along the path for the curvature of the likelihood
 _MOST_S = 1.2
 _TOLERANCE = 0.1  # share of a step
 _APART, _ROUNDS = 0.6, 3  # spacing of lags with a new search, in distances to the nearest sources, and rounds of each
+_MOST_APART = 30  # lags on either side with a new search, which bounds its cost where the carrier is fast
 _WRONG = 1.5  # χ² per reading above which sources may belong to another lag
 _SETTLING = 8  # most repetitions of the search for a lag
 _MISFIT, _SHARE = 2.0, 0.5  # largest χ² per reading, or share of that without a lag
@@ -95,8 +96,9 @@ def estimate_lag(piece_at: Callable[[float], Piece], here: Trial | None = None, 
             return ClockLag(0.0, math.sqrt(2.0 / curvature))
         at = best_near(here)
         if at.chi2 > _WRONG:  # each source may be found twice, once for each direction of travel
-            n = math.ceil(_MOST_S / apart)
-            lags = np.linspace(-_MOST_S, _MOST_S, 2 * n + 1).tolist()
+            n = min(math.ceil(_MOST_S / apart), _MOST_APART)
+            most_s = min(_MOST_S, n * apart)
+            lags = np.linspace(-most_s, most_s, 2 * n + 1).tolist()
             new = [fit_at_lag(piece_at, lag_s, None) for lag_s in lags]
             here = min(here, new[n], key=by_cost)
             at = min(at, best_near(min(new, key=by_cost)), key=by_cost)

@@ -173,7 +173,7 @@ def search_rounds(piece: Piece, most: int) -> Sources:
 
     The search includes the surroundings, because strong sources there disturb the tile.
     """
-    model = piece.model()
+    model = replace(piece.model(), counts_misfits=most == MOST_ROUNDS)
     reach = _BESIDE * (model.record.height_m - model.bounds.low_m[2])
     low, high = np.append(piece.tile.low_m - reach, -math.inf), np.append(piece.tile.high_m + reach, math.inf)
     grid = SearchGrid.below(model.record, np.maximum(model.bounds.low_m, low), np.minimum(model.bounds.high_m, high))
@@ -193,7 +193,7 @@ def measure_targets(piece: Piece, *, keep_all: bool = False) -> Arrays:
 
     Sources that are not significant are dropped, unless all are to be kept.
     """
-    model = piece.model()
+    model = replace(piece.model(), counts_misfits=True)
     groups = partial(piece.groups, model.record)
     fit, background = (model.refit if keep_all else model.fit)(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
     record = model.record

@@ -30,7 +30,8 @@ _LEAST_DEPTH_M, _LOWEST = 0.1, 0.1  # least distance to the shallowest sources; 
 _LEAST_JITTER_M = 0.01
 _BASE_STEP, _BASE_NOISE_T = 0.4, 1e-10  # usual step of a base's rows relative to the depth of sources, and its noise
 _LONG_GAP, _LONG_GAP_S = 5.0, 30.0  # shortest long gap of a base, in usual steps and in seconds
-_FASTEST_M_S = 300.0
+FASTEST_M_S = 300.0
+"""Speed between two rows above which their places leap."""
 _BLOCK = 2**18  # rows per block
 _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the best sensor
 
@@ -165,7 +166,7 @@ def leaping_rows(readings: Readings) -> BoolArray:
     """Return the rows (n,) whose place is far from those before and after."""
     assert readings.array_position_m is not None
     way, time_s = np.linalg.norm(np.diff(readings.array_position_m, axis=0), axis=1), readings.time_s
-    leaps = way > _FASTEST_M_S * np.diff(time_s)
+    leaps = way > FASTEST_M_S * np.diff(time_s)
     wild = np.concatenate([[False], leaps[1:] & leaps[:-1], [False]])
     if wild.any():
         _LOG.warning(f"spikes in the places: {wild.sum()}; their rows are left out")

@@ -25,6 +25,8 @@ _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
 _FELT = 0.3  # smallest change of sources that counts, in units of the noise of a group of rows
 _REACH = 0.6  # largest shift in a fit, relative to the distance from the sensors
+NEAR = 1.5
+"""Distance on the map within which rows are above a source, relative to that from the sensors."""
 _TWINS = 0.15  # largest distance of sources that are merged, relative to that from the sensors
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
@@ -51,6 +53,7 @@ class SurveyModel:
     threshold: float
     body_length_m: float = 0.0
     beside: Sources | None = None
+    counts_misfits: bool = False
 
     @property
     def nearest_m(self) -> float:
@@ -101,7 +104,7 @@ class SurveyModel:
             fit = fit_jointly(self.record, background, sources, self._around(sources), settled=settled)
             if not len(sources):
                 break
-            kept = fit.significance > self.threshold
+            kept = fit.significance > self.threshold * self._misfits(fit, background)
             if weighing:  # at the start pose errors hide the signal that keeps a source off an edge
                 kept &= self.bounds.contains(fit.sources)
             sources = fit.sources.some(kept).without_twins(_TWINS * self._distances(fit.sources.some(kept)))
@@ -111,6 +114,18 @@ class SurveyModel:
             background = self.background(sources, group)
             fit = fit_jointly(self.record, background, sources, self.bounds, settled=settled)
         return self.relinearise(fit, background, group) if settled < _SETTLED_COARSELY else (fit, background)
+
+    def _misfits(self, fit: JointFit, background: SurveyBackground) -> FloatArray:
+        """Return χ² per reading above each source (K,), or 1 where it is about that or does not count.
+
+        Where errors are larger than stated, a source has to explain more, as in an F-test. Otherwise each false source
+        would make room for the next. It does not count before the lag is known, which divides a source into two.
+        """
+        if not self.counts_misfits:
+            return np.ones(len(fit.sources))
+        left, above = residuals_above(self.record, fit, background)
+        chi2 = np.array([np.mean(left[near] ** 2) if near.any() else 1.0 for near in above])
+        return np.asarray(np.where(chi2 > _MISFIT, chi2, 1.0))
 
     def relinearise(
         self, fit: JointFit, background: SurveyBackground, group: IntArray, most: int = _MOST_STEPS
@@ -140,6 +155,14 @@ class SurveyModel:
             for background, level in zip(of_levels, grid.levels.values(), strict=True)
             for candidates in search(self.record, background, sources, level)
         ]
+
+
+def residuals_above(record: SurveyRecord, fit: JointFit, background: SurveyBackground) -> tuple[FloatArray, BoolArray]:
+    """Return the white residuals of groups (g, k) without the layer, and which groups are above each source (K, g)."""
+    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(background.white.n_groups, -1)
+    middles, position = record.middles_m[background.white.starts[:-1]], fit.sources.position_m
+    reach = NEAR * record.height_above(position)[:, None]
+    return left, np.linalg.norm(position[:, None, :2] - middles[:, :2], axis=-1) < reach
 
 
 @dataclass

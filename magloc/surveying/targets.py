@@ -12,12 +12,11 @@ from scipy.special import chdtri
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.surveying.fit.joint_fit import JointFit, SurveyBackground, jacobian_of, residual_of, with_free_sources
-from magloc.surveying.rounds import WHILE_SEARCHING, Groups, SurveyModel
+from magloc.surveying.rounds import NEAR, WHILE_SEARCHING, Groups, SurveyModel, residuals_above
 from magloc.surveying.search import WINDOW, groups_near, likeliest_moments, normal_equations
 
 TARGET_ENTRIES = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
 _WEAK = 200.0
-_NEAR = 1.5
 _MISFIT = 1.5  # χ² per reading
 _LASTING = 3.72  # standard deviations, one-sided
 _N_DEPTHS = 16
@@ -167,16 +166,13 @@ def targets_of(
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     flat = record.terrain.flatten(sources.position_m)
     rim = np.minimum(flat - model.bounds.low_m, model.bounds.high_m - flat)
-    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(background.white.n_groups, -1)
+    left, above = residuals_above(record, fit, background)
     directions = record.directions(sources.fields(record))
     Q = with_free_sources(record, background, sources)
     free = fit.residual - Q @ (Q.T @ fit.residual)
     second = np.zeros(K)
     for j in np.flatnonzero(which):
         second[j] = second_source_chi2(model, background, directions, Q, free, sources.position_m[j])
-    middles = record.middles_m[background.white.starts[:-1]]
-    reach = _NEAR * record.height_above(sources.position_m)[:, None]
-    above = np.linalg.norm(sources.position_m[:, None, :2] - middles[:, :2], axis=-1) < reach
     merged = second > chdtri(_N_SECOND, _FALSE_MERGED)
     for j in np.flatnonzero(merged):
         moved = shift_by_second(model, fit, background, Q, free, int(j))
@@ -188,7 +184,7 @@ def targets_of(
     interval = np.maximum(0.0, interval)
     flags = {
         "weak": weak,
-        "near": apart.min(axis=1, initial=np.inf) < _NEAR * depth + 0.5,
+        "near": apart.min(axis=1, initial=np.inf) < NEAR * depth + 0.5,
         "misfit": np.array([is_misfit(left, np.flatnonzero(near)) for near in above], np.bool_),
         "merged": merged,
         "edge": (rim[:, :2] < 0.3).any(axis=1) | (rim[:, 2] < 0.02),

@@ -293,6 +293,12 @@ class TestTracks:
         )
         assert found.interpolated_m.shape == after_s.shape
 
+    def test_clocks_that_overlap_in_part(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+        """The log ends 1.55 s after the positions, as with a clock that is late."""
+        self.read(tmp_path)
+        assert "31 of 80 rows of the log have no position" in caplog.text
+        assert "GPS time by 18 s" in caplog.text
+
     def test_clocks_apart(self, tmp_path: Path) -> None:
         with pytest.raises(
             arrays.InputError, match=r"walk\.pos: found 1777\d+ to 1777\d+ s, expected positions from 1774"

@@ -121,6 +121,19 @@ class TestLag:
         assert value(quality, "lag") == pytest.approx(1e3 * late / RATE_Hz, abs=4.0 * value(quality, "lag ±") + 5.0)
         assert "lag" in quality.flags
 
+    def test_places_in_another_unit(self, caplog: pytest.LogCaptureFixture) -> None:
+        """In mm: no search, a sentence, and the other checks."""
+        assert ROWS.array_position_m is not None
+        quality = magloc.check_quality(PAIR, replace(ROWS, array_position_m=1e3 * ROWS.array_position_m))
+        assert quality.lag is None
+        assert "the lag is not estimated" in caplog.text
+
+    def test_a_place_that_leaps(self, caplog: pytest.LogCaptureFixture) -> None:
+        assert ROWS.array_position_m is not None
+        places = ROWS.array_position_m + 1e2 * (np.arange(len(ROWS)) > 400)[:, None] * [1.0, 0.0, 0.0]
+        assert magloc.check_quality(PAIR, replace(ROWS, array_position_m=places)).lag is None
+        assert "the lag is not estimated" in caplog.text
+
     def test_scalar_sensors_without_the_ambient_field(self) -> None:
         quality = magloc.check_quality(PAIR, replace(ROWS, ambient_T=None))
         assert quality.lag is None

@@ -1,0 +1,55 @@
+"""Lag between readings and poses of a field log, from its strongest anomaly."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.grids.work import workers
+from magloc.readings import Readings
+from magloc.surveying.clock import ClockLag
+from magloc.surveying.piece import Ground, strongest_sources
+from magloc.surveying.preparation import FASTEST_M_S, FEWEST_ROWS, field_moduli
+from magloc.surveying.survey import tile_rows
+
+_LOG = logging.getLogger(__name__)
+_HEIGHTS, _SPACINGS = 10.0, 3.0  # half width of the area from which the lag is estimated
+_MOST_ROWS = 10_000
+
+
+def without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
+    """Return moduli less that of the ambient field, where it is known for every row."""
+    if rows.ambient_T is None:
+        return moduli_T
+    return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
+
+
+def clock_lag(array: SensorArray, rows: Readings, ground: Ground, spacing_m: float) -> ClockLag | None:
+    """Return the lag of the rows around the strongest anomaly; None if they show no target."""
+    known = rows.ambient_T is not None or array.ambient_T is not None
+    if len(rows) < FEWEST_ROWS or not (known or not array.channel_is_scalar.any()):
+        return None
+    assert rows.array_position_m is not None
+    speed_m_s = np.linalg.norm(np.diff(rows.array_position_m, axis=0), axis=1) / np.diff(rows.time_s)
+    if (fastest := float(speed_m_s.max())) > FASTEST_M_S:
+        _LOG.warning(
+            f"the lag is not estimated: found places that move at up to {fastest:.2g} m/s, expected {FASTEST_M_S:g} m/s"
+            " at most; check times, units and spikes of the places"
+        )
+        return None
+    moduli = without_ambient(rows, field_moduli(array, rows.values_T)).mean(axis=1)
+    middle = rows.array_position_m[np.argmax(np.abs(moduli - np.median(moduli)))]
+    height_m = float(np.median(-ground.terrain.depth_of(rows.array_position_m)))
+    half_m = max(_HEIGHTS * height_m, _SPACINGS * spacing_m)
+    apart_m = np.abs(rows.array_position_m - middle)[:, :2].max(axis=1)
+    nearest = np.argsort(apart_m)[:_MOST_ROWS]
+    near = rows[np.sort(nearest[apart_m[nearest] < half_m])]
+    if len(near) < FEWEST_ROWS:
+        return None
+    tiled = tile_rows(array, near, ground)
+    with workers(1, None, None) as each:
+        tiled, _ = tiled.settle(strongest_sources, each, lambda _: None)
+    return tiled.correct_lag(array.pose is None and rows.pose_sigma is None)[1] if len(tiled.sources) else None
