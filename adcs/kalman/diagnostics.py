@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from adcs.environment.orbit import EARTH_RADIUS_M
 from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, SensorSet
 from adcs.kalman.mekf import deviations, residuals
 from adcs.quaternion import rotate_back
-from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
+from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS, is_blinded, is_in_field
 from adcs.satellite.telemetry import Record, instants_as_runs, is_read
 from arrays.typing import BoolArray, FloatArray
 from magloc.navigation.rotations import cross_matrix
@@ -32,6 +33,7 @@ BLOCK = 64
 """Number of readings per sum of residuals; white noise averages out in it, lasting errors do not."""
 SEEN = 0.7
 """Smallest observable amplitude of the attitude, in standard deviations of the readings of one instant."""
+_LEAST_WRONG, _RIM = 0.1, 0.05
 PERIODS_S = (100.0, 300.0, 1000.0)
 """Periods of the torques for which the smallest observable amplitude is reported."""
 
@@ -46,7 +48,7 @@ class AttitudeProblem(NamedTuple):
 def find_problems(record: Record, estimates: AttitudeTracks) -> tuple[tuple[AttitudeProblem, ...], ...]:
     """Find the problems of each run, in the order of this list.
 
-    - eclipse, no star tracker reading (over-rate or blinded),
+    - eclipse, no reading of the Sun sensor or of the star tracker, with its reason where the geometry has one,
     - Sun and field on one line,
     - one direction with a biased gyro,
     - readings that contradict the rest,
@@ -59,7 +61,7 @@ def find_problems(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Atti
     always = np.ones(estimates.q.shape[1], dtype=np.bool_)
     return tuple(
         (
-            *_sun_gaps(record, used, run),
+            *_sun_gaps(record, estimates, run),
             *_star_gaps(record, estimates, run),
             *_collinearity(record, used, run),
             *_one_vector(record, estimates, run),
@@ -92,34 +94,64 @@ def collinear_rows(record: Record, used: SensorSet, run: int) -> BoolArray:
     return np.asarray(near & is_read(record.readings.sun[run]))
 
 
-def _sun_gaps(record: Record, used: SensorSet, run: int) -> list[AttitudeProblem]:
-    if not used.sun:
+def _sun_gaps(record: Record, estimates: AttitudeTracks, run: int) -> list[AttitudeProblem]:
+    if not estimates.settings.sensors.sun:
         return []
-    missing = ~is_read(record.readings.sun[run])
-    dark = missing & ~record.environment.sunlit[run]
-    problems = []
-    if dark.any():
-        problems.append(AttitudeProblem(f"eclipse: no Sun for {_seconds(dark, record)}; attitude is degraded", dark))
-    if (missing & ~dark).any():
-        outside = missing & ~dark
-        problems.append(AttitudeProblem(f"Sun outside of all heads' fields for {_seconds(outside, record)}", outside))
-    return problems
+    around, read = record.environment, is_read(record.readings.sun[run])
+    missing = _logged(record, run) & ~read
+    dark = missing & ~around.sunlit[run]
+    sun_body = rotate_back(estimates.q[run], around.sun_orbital[run])
+    beside = ~is_in_field(record.satellite.sun_sensor, sun_body).any(axis=-1) & around.sunlit[run]
+    outside, unexplained = _split_gaps(missing & ~dark, beside, read)
+    reasons = {
+        "eclipse: no Sun for {}; attitude is degraded": dark,
+        "Sun outside of all heads' fields for {}": outside,
+        "no reading of the Sun sensor for {}: neither eclipse nor its heads' fields explain it": unexplained,
+    }
+    return [AttitudeProblem(text.format(_seconds(at, record, run)), at) for text, at in reasons.items() if at.any()]
 
 
 def _star_gaps(record: Record, estimates: AttitudeTracks, run: int) -> list[AttitudeProblem]:
     if not estimates.settings.sensors.star:
         return []
-    missing = ~is_read(record.readings.star[run])
-    limit = record.satellite.star_tracker.rate_limit_rad_s
+    read, tracker = is_read(record.readings.star[run]), record.satellite.star_tracker
+    missing = _logged(record, run) & ~read
+    limit = tracker.rate_limit_rad_s
     fast = missing & (np.linalg.norm(estimates.w[run], axis=-1) > limit)
-    blind = missing & ~fast
-    problems = []
-    if fast.any():
-        text = f"star tracker over-rate: above {math.degrees(limit):g}°/s for {_seconds(fast, record)}"
-        problems.append(AttitudeProblem(text, fast))
-    if blind.any():
-        problems.append(AttitudeProblem(f"star tracker blinded by Sun or Earth for {_seconds(blind, record)}", blind))
-    return problems
+    blind, unexplained = _split_gaps(missing & ~fast, is_blinded(tracker, estimates.q[run], *_sky(record, run)), read)
+    reasons = {
+        f"star tracker over-rate: above {math.degrees(limit):g}°/s for {{}}": fast,
+        "star tracker blinded by Sun or Earth for {}": blind,
+        "no reading of the star tracker for {}: neither its rate nor Sun or Earth explain it": unexplained,
+    }
+    return [AttitudeProblem(text.format(_seconds(at, record, run)), at) for text, at in reasons.items() if at.any()]
+
+
+def _sky(record: Record, run: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return direction to the Sun (n, 3), angular radius of the Earth (n,) and visible part of the Sun (n,)."""
+    around = record.environment
+    radius = np.arcsin(np.minimum(1.0, EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[run], axis=-1)))
+    return around.sun_orbital[run], radius, around.illuminated[run]
+
+
+def _logged(record: Record, run: int) -> BoolArray:
+    """Return the instants (n,) of rows of the log, which have a reading; all with at most one sensor."""
+    seen = np.stack([there[run] for there in record.readings.seen.values()])
+    alone = seen.any(axis=1).sum() < 2
+    return np.asarray(seen.any(axis=0) | alone)
+
+
+def _split_gaps(missing: BoolArray, expected: BoolArray, read: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Split missing readings (n,) into those that the geometry explains, and others.
+
+    The geometry explains none if readings are there where it allows none: the sensor is mounted otherwise. A few
+    readings at the rim, where the attitude's error decides, belong to the rest.
+    """
+    contradicted = (expected & read).sum() > _LEAST_WRONG * expected.sum()
+    explained = missing & expected & ~contradicted
+    if (missing & ~explained).sum() <= _RIM * explained.sum():
+        explained = missing
+    return explained, missing & ~explained
 
 
 def _collinearity(record: Record, used: SensorSet, run: int) -> list[AttitudeProblem]:
@@ -128,7 +160,7 @@ def _collinearity(record: Record, used: SensorSet, run: int) -> list[AttitudePro
         return []
     least = math.degrees(float(record.environment.separation_rad[run, near].min()))
     known = "known by the gyro only" if used.gyro else "not observable there"
-    text = f"{COLLINEAR} within {least:.0f}° for {_seconds(near, record)}: the turn about it is {known}"
+    text = f"{COLLINEAR} within {least:.0f}° for {_seconds(near, record, run)}: the turn about it is {known}"
     return [AttitudeProblem(text, near)]
 
 
@@ -146,7 +178,7 @@ def _one_vector(record: Record, estimates: AttitudeTracks, run: int) -> list[Att
     alone = seen < 2
     if not alone.any():
         return []
-    begins = f"one direction and a gyro for {_seconds(alone, record)}"
+    begins = f"one direction and a gyro for {_seconds(alone, record, run)}"
     if "gyro-bias" not in used.states:
         return [AttitudeProblem(f"{begins}: a bias of the gyro is not in the state and would accumulate", alone)]
     sigma_deg = np.degrees(2.0 * estimates.sigma[run, :, :3].max(axis=-1))
@@ -295,5 +327,8 @@ def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Map
     return torque
 
 
-def _seconds(rows: BoolArray, record: Record) -> str:
-    return f"{rows.sum() * record.dt_s:.0f} s"
+def _seconds(at: BoolArray, record: Record, run: int) -> str:
+    """Return the duration of instants (n,) in words: each row of the log lasts until the next one."""
+    rows = np.flatnonzero(_logged(record, run))
+    lasts = np.diff(record.environment.time_s[rows], append=record.environment.time_s[rows[-1:]] + record.dt_s)
+    return f"{lasts[at[rows]].sum():.0f} s"

@@ -28,11 +28,15 @@ _FACTOR = 1.4
 _ANGLE_RAD = math.radians(20.0)
 _TURN_RAD = math.radians(45.0)
 _LEAST_TURN_RAD = math.radians(5.0)
-# Beyond gains 5 % and a bias of 2 µT in 25 µT together, which an uncalibrated magnetometer may have.
-_MOST_MODULUS_ERROR = 0.15
+# Gains 5 % off and a bias of 2 µT in 25 µT along each axis, as of an uncalibrated magnetometer, make 9 % rms.
+_MOST_MODULUS_ERROR = 0.1
+_NAMED_MODULUS_ERROR = 0.05
 _WRONG_ORBIT = (
     "the modulus of the field is {} % (rms) off its model along the orbit: check the start, altitude, inclination and "
     "node of the orbit, or calibrate the magnetometer"
+)
+_ALSO_ORBIT = (
+    " The modulus of the field is {:.0f} % (rms) off its model, which signs and axes cannot cause: check the orbit too."
 )
 FIELD_UNITS = {
     "µT taken for nT": 1e3,
@@ -107,9 +111,10 @@ def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str
                 "of a sensor cannot cause. Check the start, altitude, inclination and node of the orbit first. If they "
                 f"are right, undo this: {', '.join(named)}."
             )
+        is_near = _NAMED_MODULUS_ERROR < error <= _MOST_MODULUS_ERROR
         raise ValueError(
             "Input telemetry must agree with itself and with the orbit; instead received readings that agree if this "
-            f"is undone: {', or '.join(named)}."
+            f"is undone: {', or '.join(named)}.{_ALSO_ORBIT.format(100 * error) if is_near else ''}"
         )
     return warnings
 

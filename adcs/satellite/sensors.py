@@ -196,15 +196,24 @@ def star_tracker_readings(
     """
     delta = tracker.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
     turned_by = quaternion.multiply(quaternion.exp(tracker.misalignment_rad), quaternion.from_error_vector(delta))
+    blinded = is_blinded(tracker, q, sun_orbital, earth_radius_rad, illuminated)
+    seen = (np.linalg.norm(w, axis=-1) <= tracker.rate_limit_rad_s) & ~blinded
+    return np.where(seen[..., None], quaternion.multiply(q, turned_by), np.nan)
+
+
+def is_blinded(
+    tracker: StarTracker,
+    q: ArrayLike,
+    sun_orbital: ArrayLike,
+    earth_radius_rad: ArrayLike,
+    illuminated: ArrayLike,
+) -> BoolArray:
+    """Return whether Sun or Earth blind a star tracker; arguments as for :func:`star_tracker_readings`."""
     axis = quaternion.rotate(q, tracker.boresight_body)
     sun_away = np.arccos(np.clip(np.sum(axis * np.asarray(sun_orbital, dtype=np.float64), axis=-1), -1.0, 1.0))
     nadir_away = np.arccos(np.clip(-axis[..., 2], -1.0, 1.0))
-    seen = (
-        (np.linalg.norm(w, axis=-1) <= tracker.rate_limit_rad_s)
-        & ((sun_away > tracker.sun_exclusion_rad) | (np.asarray(illuminated) <= 0.0))
-        & (nadir_away > np.asarray(earth_radius_rad) + tracker.earth_exclusion_rad)
-    )
-    return np.where(seen[..., None], quaternion.multiply(q, turned_by), np.nan)
+    sees_sun = (sun_away <= tracker.sun_exclusion_rad) & (np.asarray(illuminated) > 0.0)
+    return np.asarray(sees_sun | (nadir_away <= np.asarray(earth_radius_rad) + tracker.earth_exclusion_rad))
 
 
 def gyro_readings(gyro: Gyro, w: ArrayLike, bias_rad_s: ArrayLike, unit_noise: ArrayLike) -> FloatArray:

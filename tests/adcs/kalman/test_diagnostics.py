@@ -7,9 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import adcs
+import sims
 from adcs.kalman.diagnostics import postfit_residuals, unseen_torque_Nm, warning_sentences
 from adcs.kalman.error_state import AttitudeTracks
 from adcs.kalman.mekf import run_filter, stacked_residuals
+from sims.attitude.scenario import StartConditions
 from sims.attitude.simulation import AttitudeRuns, simulate
 from tests.adcs.filter_runs import ANY_START, believed_runs, settings, start_of, tabletsat
 
@@ -75,3 +78,53 @@ class TestUnseenTorque:
         seen, alone = (unseen_torque_Nm(runs, one, 0) for one in (tracks, run_filter(runs, without, start_of(runs))))
         assert seen[100.0] < 0.7 * alone[100.0]
         assert seen[1000.0] == pytest.approx(alone[1000.0], rel=0.1)
+
+
+class TestMissingReadings:
+    """Gaps that neither Sun, Earth, shadow nor heads explain, in a log of every second second."""
+
+    def warnings(self, lost: slice, sensors: str) -> str:
+        runs = simulate(replace(tabletsat(400.0), conditions=StartConditions()), [3])
+        log = adcs.Telemetry.of(runs, runs.satellite.start)
+        every = slice(None, None, 2)
+        star, sun = log.star[every].copy(), log.sun[every].copy()
+        star[lost] = sun[lost] = np.nan
+        thinned = adcs.Telemetry(
+            log.time_s[every],
+            star=star,
+            gyro_rad_s=log.gyro_rad_s[every],
+            field_T=log.field_T[every],
+            sun=sun,
+            wheels_Nms=log.wheels_Nms[every],
+            step_s=1.0,
+        )
+        return " ".join(adcs.estimate(thinned, runs.satellite, sensors=sensors).warnings)
+
+    def test_nothing_is_missing_between_rows(self) -> None:
+        text = self.warnings(slice(0, 0), "st+gyro+mag+sun")
+        assert "no reading" not in text
+        assert "blinded" not in text
+        assert "Sun" not in text
+
+    def test_of_no_known_reason(self) -> None:
+        """Twenty rows of two seconds."""
+        text = self.warnings(slice(50, 70), "st+gyro+mag+sun")
+        assert "no reading of the star tracker for 40 s: neither its rate nor Sun or Earth" in text
+        assert "no reading of the Sun sensor for 40 s: neither eclipse nor its heads' fields" in text
+        assert "blinded" not in text
+        assert "outside of all heads" not in text
+
+    def test_of_a_tracker_that_is_blinded(self) -> None:
+        """By the Sun and the Earth of the simulation; then the same gaps of a tracker on another side."""
+        runs = sims.simulate(sims.read_scenario("star-blinded"), [0])
+        assert isinstance(runs, AttitudeRuns)
+        turned = replace(runs.satellite.star_tracker, boresight_body=np.array([0.0, 1.0, 0.0]))
+        found = []
+        for satellite in (runs.satellite, replace(runs.satellite, star_tracker=turned)):
+            record = replace(runs, satellite=satellite)
+            tracks = run_filter(record, settings("st+gyro"), start_of(runs))
+            found.append([text for text in warning_sentences(record, tracks)[0] if "rate" not in text.split(":")[0]])
+        lost = np.isnan(runs.readings.star[0, :, 0]) & (np.linalg.norm(runs.w[0], axis=-1) <= np.radians(2.0))
+        assert f"star tracker blinded by Sun or Earth for {lost.sum()} s" in found[0]
+        assert not any("blinded" in text for text in found[1])
+        assert any(f"no reading of the star tracker for {lost.sum()} s" in text for text in found[1])

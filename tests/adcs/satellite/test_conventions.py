@@ -108,6 +108,16 @@ class TestLeftAlone:
         with pytest.raises(ValueError, match="Check the start, altitude"):
             adcs.estimate(log, replace(satellite, orbit=orbit), sensors="mag+sun+gyro", states=["gyro-bias"])
 
+    @pytest.mark.parametrize(("gain", "words"), [(1.0, ""), (1.08, "check the orbit too"), (1.13, "Check the start")])
+    def test_a_modulus_that_is_off_names_the_orbit(self, flight, gain, words):
+        """Exchanged axes, and a modulus that they do not explain."""
+        log, satellite = flight
+        with pytest.raises(ValueError, match="undo") as refused:
+            adcs.estimate(changed(log, field_T=gain * log.field_T[:, [1, 0, 2]]), satellite, sensors=SENSORS)
+        assert words in str(refused.value)
+        assert "its axes x and y exchanged" in str(refused.value)
+        assert ("orbit too" in str(refused.value)) == (gain == 1.08)
+
     def test_a_wrong_orbit_that_no_axis_explains_is_a_warning(self, flight):
         log, satellite = flight
         orbit = adcs.circular_orbit(altitude_m=1500e3, inclination_deg=97.8, local_time_h=15.0, epoch=satellite.start)
