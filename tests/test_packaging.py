@@ -20,6 +20,7 @@ GROUPS = PYPROJECT["dependency-groups"]
 # Modules that are named otherwise than their distribution.
 DISTRIBUTIONS = {
     "IPython": "ipython",
+    "allantools": "AllanTools",
     "PIL": "pillow",
     "_cffi_backend": "cffi",
     "erfa": "pyerfa",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from os import PathLike
 
 import numpy as np
@@ -67,6 +67,8 @@ class Proposal:
         Sentence about a log without lines, in place of that about the header.
     sensor_lines : tuple of str
         Further lines of the table of each sensor.
+    noise_lines : dict
+        Measured noise of a sensor, by its id, as lines of its table.
     """
 
     channels: dict[str, str]
@@ -76,6 +78,7 @@ class Proposal:
     header_line: int
     about: str = ""
     sensor_lines: tuple[str, ...] = ()
+    noise_lines: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def toml(self) -> str:
         """Return the text of an array file with the table, and comments with open questions."""
@@ -87,7 +90,7 @@ class Proposal:
         for name, of in self.sensors.items():
             kind = "scalar" if isinstance(of, str) else "vector"
             lines += ["", "[[sensor]]", f'id = "{name}"', f'kind = "{kind}"', "position_m = [0.0, 0.0, 0.0]  # asked"]
-            lines += ["noise_nT = 1.0  # asked", *self.sensor_lines]
+            lines += [*self.noise_lines.get(name, ["noise_nT = 1.0  # asked"]), *self.sensor_lines]
         lines += ["", "[columns]", *(f"{key} = {toml_value(value)}" for key, value in self.keys.items())]
         lines += ["", "[columns.sensors]", *(f"{name} = {toml_value(of)}" for name, of in self.sensors.items())]
         return "\n".join([*lines, ""])

@@ -102,6 +102,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "readings.csv --out out.toml",
         "magarrow.csv --instrument magarrow",
         "robot.ulg --out out.toml",
+        "robot.ulg --rest out",
     ),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
@@ -342,7 +343,7 @@ def write_files(folder: Path) -> None:
     with (folder / "sources.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --sources 1 --json")
     _write_log(folder)
-    (folder / "robot.ulg").write_bytes(RobotFlight(duration_s=3.0).px4())
+    (folder / "robot.ulg").write_bytes(RobotFlight(duration_s=5.0, swing_rad=0.0).px4())
     _write_magarrow(folder)
     rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
