@@ -52,7 +52,7 @@ def calibrate_log(
     common : QuietOptions
         Common options.
     """
-    from adcs.io.autopilot_files import writer_of
+    from adcs.io.autopilot_files import axes_warning, writer_of
 
     refuse_one_for_two({"LOG": log, "--out": out})
     refuse_unwritable(out, "--out")
@@ -66,7 +66,8 @@ def calibrate_log(
     seconds = time.perf_counter() - began
     write(found, out)
     note(f"wrote {out}")
-    flags = (*file.warnings, *found.flags)
+    axes = "" if out.suffix.lower() == ".toml" else axes_warning(found)
+    flags = (*file.warnings, *found.flags, *([axes] if axes else []))
     warn(flags)
     if json:
         print_report({**found.report(), "flags": list(flags), "seconds": seconds})

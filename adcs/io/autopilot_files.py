@@ -89,6 +89,16 @@ def _axes(name: str, values: FloatArray) -> Parameters:
     return {name.format(axis): float(value) for axis, value in zip("XYZ", values, strict=True)}
 
 
+def axes_warning(found: LogCalibration) -> str:
+    """Return a sentence if z of the log's axes points up, where autopilots have forward, right, down."""
+    if found.fit.estimate.problem.inertial.acceleration_m_s2[:, 2].mean() < 0.0:
+        return ""
+    return (
+        "axes of the log: found z upwards, expected the autopilot's (forward, right, down); state a mounting in the"
+        " layout (--config), or the parameters have other axes"
+    )
+
+
 def _write_px4(found: LogCalibration, path: Path) -> None:
     """Write a parameter file as QGroundControl loads it."""
     lines = ["# Onboard parameters for Vehicle 1", "# Vehicle-Id Component-Id Name Value Type"]

@@ -149,6 +149,8 @@ def _binary_log(log: Log, currents: Sequence[str]) -> VehicleFile:
         kept = [one for one, unit in zip(series, units, strict=True) if _varies(one, _LEAST_RANGE.get(unit, 0.02))]
         series = kept[:1]
     corrected = best[0].name.startswith(("vehicle_magnetometer", "sensor_combined", "MAG"))
+    if corrected and len(best) == 1 and (raw := _uncorrected(best[0], log)) is not None:
+        best, corrected = [raw], False
     with naming(log.path):
         vehicle = VehicleLog(
             gyro.time_s, gyro.values, _at(force, gyro.time_s), tuple(best), tuple(_whole(one) for one in series)
@@ -166,6 +168,27 @@ _CORRECTED = (
     "the fields of {} are those that the autopilot has corrected: the calibration adds to its parameters, and does not"
     " replace them"
 )
+
+
+def _uncorrected(series: Series, log: Log) -> Series | None:
+    """Return fields without the calibration of PX4's parameters; None where they are unknown or turn the axes."""
+    values = log.parameters
+    slots = [k for k in range(4) if values.get(f"CAL_MAG{k}_ID")]
+    prime = [k for k in slots if values[f"CAL_MAG{k}_ID"] == values.get("CAL_MAG_PRIME")]
+    if not slots or values.get("CAL_MAG_COMP_TYP"):
+        return None
+    k = (prime or slots)[0]
+    begin = f"CAL_MAG{k}_"
+    # An internal magnetometer (-1) has the rotation of the board.
+    number = values.get(f"{begin}ROT", 0.0)
+    if number > 0.0 or (number < 0.0 and values.get("SENS_BOARD_ROT")):
+        return None
+    scale = np.diag([values.get(f"{begin}{axis}SCALE", 1.0) or 1.0 for axis in "XYZ"])
+    for axis, i, j in (("X", 0, 1), ("Y", 0, 2), ("Z", 1, 2)):
+        scale[i, j] = scale[j, i] = values.get(f"{begin}{axis}ODIAG", 0.0)
+    offset_T = 1e-4 * np.array([values.get(f"{begin}{axis}OFF", 0.0) for axis in "XYZ"])
+    raw = series.values @ np.linalg.inv(scale).T + offset_T
+    return replace(series, values=raw, device_id=int(values[f"{begin}ID"]))
 
 
 def _triple(log: Log, pattern: str) -> Series | None:

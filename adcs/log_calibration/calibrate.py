@@ -67,13 +67,7 @@ class LogCalibration(Drawn):
 
     def is_determined(self, magnetometer: str, *kinds: str) -> bool:
         """Return True if all terms of some kinds of a magnetometer are determined."""
-        terms = self.terms
-        own = [
-            known
-            for name, kind, known in zip(terms.names, terms.kinds, terms.determined, strict=True)
-            if name.startswith(f"{magnetometer} ") and kind in kinds
-        ]
-        return all(own)
+        return self.terms.are_known(magnetometer, *kinds)
 
     def matrix(self, m: int) -> FloatArray:
         """Return the matrix (3, 3) of a magnetometer: reading = matrix · field in body axes + offset."""
@@ -216,10 +210,10 @@ def calibrate_log(
         field,
         ranges,
     )
-    return LogCalibration(log, fit, terms, tuple(advice(fit, terms)), tuple(_flags(log, fit)))
+    return LogCalibration(log, fit, terms, tuple(advice(fit, terms)), tuple(_flags(fit, terms)))
 
 
-def _flags(log: VehicleLog, fit: LogFit) -> Iterator[str]:
+def _flags(fit: LogFit, terms: Terms) -> Iterator[str]:
     """Yield sentences on doubts."""
     estimate, data = fit.estimate, fit.estimate.problem.inertial
     if not fit.converged:
@@ -237,9 +231,9 @@ def _flags(log: VehicleLog, fit: LogFit) -> Iterator[str]:
                 f" COMPASS_ORIENT{m + 1 if m else ''} = {number} (ArduPilot)"
             )
         angle = math.degrees(float(np.linalg.norm(turn)))
-        if angle > _TURNED_DEG:
+        if angle > _TURNED_DEG and terms.are_known(name, "axes"):
             yield f"{name} is turned by {angle:.0f}° against the nearest usual mounting"
-        if np.abs(symmetric - np.eye(3)).max() > _LARGE_SOFT_IRON:
+        if np.abs(symmetric - np.eye(3)).max() > _LARGE_SOFT_IRON and terms.are_known(name, "soft iron"):
             yield f"{name} has soft iron of more than {100.0 * _LARGE_SOFT_IRON:.0f} %: check its unit and its axes"
         parts = _parts(fit.disturbed[m])
         for begin, end in parts[:3]:

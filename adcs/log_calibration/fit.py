@@ -19,6 +19,7 @@ from magloc.least_squares import minimise
 
 _ROUNDS, _DISTURBED_AT = 6, (1, 2, 3)
 _STEP = 0.7  # of the logarithm of a noise
+_PRIOR_WIDTHS, _SLOW_WIDTH = (1.0, 0.7, 1.0), 1.5  # of walk, drift and velocity; of slow fields
 _TURN_RAD_RTS = (1e-5, 1e-2)
 _SIGMA = ((1e-5, 1e-2), (0.05, 100.0), (3e-3, 10.0))  # of gyro drift [rad/s], velocity [m/s], slow fields [µT]
 _TIME_S = ((100.0, 100.0), (1.0, 100.0), (2.0, 200.0))
@@ -97,8 +98,8 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
     M = len(magnetometers)
     used = tuple(np.ones(len(one.time_s), np.bool_) for one in magnetometers)
     q = start.q[data.knots]
-    noise = Noise.usual(M)
-    noise = replace(noise, white_uT=np.full(M, 3.0), turn_rad_rts=3e-3)
+    usual = replace(Noise.usual(M), turn_rad_rts=_gyro_noise(data))
+    noise = replace(usual, white_uT=np.full(M, 3.0), turn_rad_rts=3e-3)
     problem = Problem(data, magnetometers, currents, used, layout, prior, sigma, field, q[0], noise)
     estimate = Estimate.at(problem, parameters, q, np.zeros((len(q), 9 + 3 * M)))
     disturbed = tuple(np.zeros(len(data.knots) - 1, np.bool_) for _ in magnetometers)
@@ -106,9 +107,9 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
         estimate = minimise(_Iterate(estimate), lambda _: 1.0, damping=1e-6, max_iterations=_ITERATIONS).point.estimate
         white = np.array([_white_noise(estimate, m) for m in range(M)])
         if round_ == 0:
-            noise = replace(Noise.usual(M), turn_rad_rts=_gyro_noise(data), white_uT=white)
+            noise = replace(usual, white_uT=white)
         else:
-            noise = most_likely_noise(LinearModel.of(estimate), replace(noise, white_uT=white))
+            noise = most_likely_noise(LinearModel.of(estimate), replace(noise, white_uT=white), usual)
         if round_ in _DISTURBED_AT:
             new = _disturbed_intervals(estimate, noise)
             disturbed = tuple(old | more for old, more in zip(disturbed, new, strict=True))
@@ -120,18 +121,27 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
     return LogFit(estimate, _Iterate(estimate).system.solve(), start.mountings, disturbed, last.converged)
 
 
-def most_likely_noise(model: LinearModel, noise: Noise) -> Noise:
-    """Return a noise of larger evidence: one step of a search along the logarithm of each of its numbers."""
-    M, best = len(noise.white_uT), model.minus_log_evidence(noise)
+def most_likely_noise(model: LinearModel, noise: Noise, usual: Noise) -> Noise:
+    """Return a noise of larger evidence: one step of a search along the logarithm of each of its numbers.
+
+    Their priors are log-normal around usual ones: a short log tells little of slow processes.
+    """
+
+    def cost_of(each: Noise) -> float:
+        return model.minus_log_evidence(each) + float(np.sum((each.logarithms - usual.logarithms) ** 2 / widths**2))
+
+    M = len(noise.white_uT)
+    widths = np.concatenate([_PRIOR_WIDTHS, np.full(M, _SLOW_WIDTH), np.ones(2 + M)])
+    best = cost_of(noise)
     for i in range(1 + 2 * (2 + M)):
         if i == 2:  # the time of the gyro's drift, which a log does not tell
             continue
         sides = [_changed(noise, i, sign * _STEP) for sign in (-1.0, 1.0)]
-        costs = [model.minus_log_evidence(side) for side in sides]
+        costs = [cost_of(side) for side in sides]
         curvature = costs[0] + costs[1] - 2.0 * best
         vertex = 0.5 * (costs[0] - costs[1]) / curvature if curvature > 0.0 else math.copysign(1.0, costs[0] - costs[1])
         trial = _changed(noise, i, _STEP * float(np.clip(vertex, -2.0, 2.0)))
-        cost = model.minus_log_evidence(trial)
+        cost = cost_of(trial)
         if cost < best:
             noise, best = trial, cost
     return noise

@@ -73,7 +73,12 @@ class Noise:
     def usual(cls, n_magnetometers: int) -> Noise:
         """Return the noise of usual sensors."""
         M = n_magnetometers
-        return cls(3e-4, np.full(M, 0.5), np.array([2e-4, 8.0, *[0.5] * M]), np.array([100.0, 8.0, *[20.0] * M]))
+        return cls(3e-4, np.full(M, 0.5), np.array([2e-4, 8.0, *[0.05] * M]), np.array([100.0, 8.0, *[20.0] * M]))
+
+    @property
+    def logarithms(self) -> FloatArray:
+        """Logarithms of the walk of the attitude, and of the σ and the times of the slow processes."""
+        return np.log(np.concatenate([[self.turn_rad_rts], self.sigma, self.time_s]))
 
     def turn_weights(self, data: InertialData) -> FloatArray:
         """Return the inverse standard deviations (K - 1,) of the rotations that the gyro does not show."""

@@ -53,6 +53,11 @@ class Terms:
         """Terms that the log determines."""
         return self.are_determined(self.sigma)
 
+    def are_known(self, magnetometer: str, *kinds: str) -> bool:
+        """Return True if all terms of some kinds of a magnetometer are determined."""
+        rows = zip(self.names, self.kinds, self.determined, strict=True)
+        return all(known for name, kind, known in rows if name.startswith(f"{magnetometer} ") and kind in kinds)
+
     def are_determined(self, sigma: FloatArray) -> BoolArray:
         """Return True for the terms whose σ would be small enough."""
         return np.asarray((sigma <= self.largest) & (sigma <= LEAST_KNOWN * self.prior_sigma))

@@ -49,6 +49,7 @@ def test_table_and_parameters(adcs, log, tmp_path):
     outcome = adcs("calibrate-log", log, *PLACE, "--out", tmp_path / "mag.params")
     assert outcome.status == 0, outcome.err
     assert "field offset x" in outcome.out
+    assert "found z upwards" in outcome.err
     assert "CAL_MAG0_XOFF" in (tmp_path / "mag.params").read_text()
 
 

@@ -14,7 +14,21 @@ from tests.written_logs import ulog
 FLIGHT = simulate_flight(2, FlightSettings(duration_s=30.0, magnetometers=2))
 
 
-def px4_log(path, *, magnetometer="sensor_mag"):
+CALIBRATED = {
+    "CAL_MAG0_ID": 0.0,
+    "CAL_MAG1_ID": 77.0,
+    "CAL_MAG1_ROT": 0.0,
+    "CAL_MAG1_XOFF": 0.1,
+    "CAL_MAG1_YOFF": -0.2,
+    "CAL_MAG1_ZOFF": 0.3,
+    "CAL_MAG1_XSCALE": 1.1,
+    "CAL_MAG1_YSCALE": 0.9,
+    "CAL_MAG1_ZSCALE": 1.0,
+    "CAL_MAG1_XODIAG": 0.02,
+}
+
+
+def px4_log(path, *, magnetometer="sensor_mag", parameters=None):
     """Write a flight as PX4 logs it; places in 1e-7 degrees."""
     log = FLIGHT.log
     stamp = (1e6 * log.time_s + 5e6).astype("u8")
@@ -52,7 +66,7 @@ def px4_log(path, *, magnetometer="sensor_mag"):
             topics.append(("sensor_mag", m, {"timestamp": at, **device, **columns}))
         elif magnetometer == "vehicle_magnetometer" and m == 0:
             topics.append(("vehicle_magnetometer", 0, {"timestamp": at, "magnetometer_ga": gauss.astype("f4")}))
-    path.write_bytes(ulog(topics))
+    path.write_bytes(ulog(topics, parameters))
     return path
 
 
@@ -92,6 +106,22 @@ class TestPx4:
         assert file.place == pytest.approx((47.3, 8.5, 500.0))
         assert file.date == "2023-11-14"
         assert not file.is_corrected
+
+    def test_corrections_of_the_parameters_are_taken_out(self, tmp_path):
+        """PX4 logs S (raw - offset), gauss; the parameters of the first device that has an identifier."""
+        path = px4_log(tmp_path / "log.ulg", magnetometer="vehicle_magnetometer", parameters=CALIBRATED)
+        file = adcs.read_vehicle(path)
+        assert not file.is_corrected
+        mag = file.log.magnetometers[0]
+        assert mag.device_id == 77
+        S = np.array([[1.1, 0.02, 0.0], [0.02, 0.9, 0.0], [0.0, 0.0, 1.0]])
+        again = (1e4 * mag.values - [0.1, -0.2, 0.3]) @ S.T
+        np.testing.assert_allclose(again, 1e4 * FLIGHT.log.magnetometers[0].values, atol=1e-6)
+
+    def test_corrections_that_turn_the_axes_are_kept(self, tmp_path):
+        turned = CALIBRATED | {"CAL_MAG1_ROT": 2.0}
+        path = px4_log(tmp_path / "log.ulg", magnetometer="vehicle_magnetometer", parameters=turned)
+        assert adcs.read_vehicle(path).is_corrected
 
     def test_corrected_fields_are_named(self, tmp_path):
         file = adcs.read_vehicle(px4_log(tmp_path / "log.ulg", magnetometer="vehicle_magnetometer"))
