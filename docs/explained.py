@@ -73,7 +73,8 @@ EXPLAINED = {
     " sims.experiments.run_scenario sims.experiments.compared_with_paper sims.experiments.detumbling"
     " sims.experiments.switching_loads",
     "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.read_imu adcs.HeadingModel"
-    " adcs.Gains adcs.AttitudeFilter adcs.AttitudeConfig adcs.AttitudeEstimate",
+    " adcs.Gains",
+    "own-hardware": "adcs.AttitudeFilter adcs.AttitudeConfig adcs.AttitudeEstimate",
     "star-identification": "adcs.solve_photograph adcs.identify_stars adcs.read_picture adcs.combined_star_fixes"
     " adcs.hipparcos_catalogue",
     "table-top-satellite": "adcs.mockup sims.table_run sims.TableScenario sims.CameraErrors sims.rendered_frame"

@@ -24,6 +24,7 @@ COMMANDS = (
     ("loads", "adcs.cli.loads:loads", "Find the fields and places of loads that switch on board."),
     ("vectors", "adcs.cli.vectors:vectors", "Compute the attitude of every row from field and Sun (TRIAD, QUEST)."),
     ("imu", "adcs.cli.imu:imu", "Estimate the attitude of an inertial unit with a magnetometer."),
+    ("live", "adcs.cli.live:live", "Estimate the attitude of an inertial unit while readings arrive."),
     ("demo", "adcs.cli.demo:demo", "Simulate a satellite and estimate its attitude."),
     ("stars", "adcs.cli.stars:stars", "Identify the stars of images."),
     ("view", "adcs.cli.view:view", "Show the attitude of a log in three dimensions."),

@@ -15,7 +15,7 @@ from magloc.cli.framework import Flag, warn
 if TYPE_CHECKING:
     from adcs.io.imu_files import ImuLog
 
-_MAGNETS: dict[str, Magnet] = {"auto": "auto", "plain": "kept", "reject": "rejected", "subtract": "subtracted"}
+MAGNETS: dict[str, Magnet] = {"auto": "auto", "plain": "kept", "reject": "rejected", "subtract": "subtracted"}
 
 
 def imu(
@@ -61,7 +61,7 @@ def imu(
     report.check()
     data = adcs.read_imu(log, config)
     began = time.perf_counter()
-    track = inertial_attitude(log, data, _MAGNETS[method], offline=offline)
+    track = inertial_attitude(log, data, MAGNETS[method], offline=offline)
     summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
     warn(track.warnings)
     if report.out is not None:

@@ -176,9 +176,9 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
     expected = "a header with a time, and columns of gyro, accelerometer and magnetometer"
     if named is None:
         table = read_table(path, expected)
-        given = _standard(table.header)
+        given = standard_table(table.header)
         try:
-            for group in _layout(given).columns.values():
+            for group in layout_of_table(given).columns.values():
                 for name in group.columns:
                     table.require(name, group.columns)
         except InputError as error:
@@ -186,8 +186,8 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
     else:
         given = named
         more = () if given.moving is None else (given.moving,)
-        table = read_named(path, expected, _layout(given), more)
-    time_s, values = columns_of(table, _layout(given))
+        table = read_named(path, expected, layout_of_table(given), more)
+    time_s, values = columns_of(table, layout_of_table(given))
     truth = values.pop("truth", None)
     values.setdefault("field_T", np.full((len(time_s), 3), np.nan))
     samples: GyroSamples = given.gyro.samples  # type: ignore[assignment]
@@ -200,15 +200,16 @@ def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
     )
 
 
-def _layout(given: ImuTable) -> LogLayout:
+def layout_of_table(given: ImuTable) -> LogLayout:
+    """Return the columns and conventions of a table."""
     columns: dict[str, Any] = {"rate_rad_s": given.gyro, "acceleration_m_s2": given.accelerometer}
     columns |= {"field_T": given.magnetometer} if given.magnetometer is not None else {}
     columns |= {"truth": given.truth} if given.truth is not None else {}
     return LogLayout(np.datetime64(0, "us"), given.time, given.time_format, columns)
 
 
-def _standard(header: tuple[str, ...]) -> ImuTable:
-    """Return the standard layout for a header."""
+def standard_table(header: tuple[str, ...]) -> ImuTable:
+    """Return the standard table for a header."""
     per_rad = SampledGyroColumns(columns=("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"), unit="rad/s")
     truth = TruthColumns()
     # A column with a similar name is a misspelt one of the magnetometer, which must be reported.

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -116,6 +117,10 @@ class RowMeasurement:
     def kernel_rows(self) -> Rows:
         """The row as an argument of kernels."""
         return stack_rows([self])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is saved: all but the kernels' argument, which holds addresses."""
+        return {name: value for name, value in vars(self).items() if name != "kernel_rows"}
 
     def chart(self, x: FloatArray) -> Chart:
         """Return the charts about states (..., n_charted)."""

@@ -15,8 +15,9 @@ compares the two.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, AcquiredSource, Acquisition, CartesianFilter
 from magloc.tracking.chart.known_moment import ConstantModulus
 from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.saved import saved_state, values_of_state
 from magloc.tracking.chart.start import NO_DIPOLE, prior_root
 from magloc.tracking.chart.steps import (
     LARGEST_WIDTH,
@@ -126,6 +128,24 @@ class Tracker(CartesianFilter):
             Time goes backwards, or the readings are not one row.
         """
         return self.advance([row])[0]
+
+    def state(self) -> dict[str, Any]:
+        """Return the state of the tracker, for a JSON file and :meth:`from_state`."""
+        return saved_state({name: value for name, value in vars(self).items() if name != "_settled"})
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Tracker:
+        """Return a tracker that resumes from a state, bit for bit.
+
+        Raises
+        ------
+        ValueError
+            The state has another version, or is damaged.
+        """
+        found = cls.__new__(cls)
+        vars(found).update(values_of_state(state))
+        found._settled = SettledTrack.of(found.array, found._motion, found.measurements, found.filter.n_differences)
+        return found
 
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None

@@ -82,6 +82,7 @@ CASES = {
     "adcs calibrate": Case("telemetry.csv --config scenario.toml --out out.csv", 200, **_SATELLITE),
     "adcs view": Case("telemetry.csv --config scenario.toml --html out.html", 200, **_SATELLITE),
     "adcs loads": Case("loads.csv --array loads.toml", 3000, files=("loads.csv",)),
+    "adcs live": Case("--from replay:imu.csv --replay-speed 1e9 --config imu.toml", 3000, files=("imu.csv",)),
     "adcs imu": Case("imu.csv --config imu.toml", 3000, files=("imu.csv",)),
     "adcs calibrate-log": Case("imu.csv --config imu.toml --out out.toml", 3000, files=("imu.csv",)),
     "adcs stars": Case("frames --catalogue stars.csv", 10, "frame", files=("frames/input.csv", "frames/result.csv")),

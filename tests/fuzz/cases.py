@@ -133,6 +133,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "imu.csv --config imu.toml --html out.html",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
+    "adcs live": ("--from - --config imu.toml", "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01"),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out", "robot.ulg --json"),
     "adcs calibrate-log": (
         "imu.csv --config imu.toml --out out.toml --json",

@@ -1,0 +1,67 @@
+"""``adcs live``: its lines are those of the filter, and bad lines end nothing."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import adcs as package
+from adcs.io.imu_streams import ImuStream
+from tests.adcs.refusals import assert_refused
+from tests.command_line import Run
+
+IMU = package.datasets.load("imu")
+LINES = IMU.path.read_text(encoding="utf-8").splitlines()[:401]
+
+
+def expected() -> list[package.AttitudeEstimate]:
+    readings = (values[: len(LINES) - 1] for values in (IMU.time_s, IMU.gyro_rad_s, IMU.acceleration_m_s2, IMU.field_T))
+    board = package.AttitudeFilter()
+    return [board.update(*row) for row in zip(*readings, strict=True)]
+
+
+def objects() -> list[str]:
+    header = LINES[0].split(",")
+    return [json.dumps(dict(zip(header, map(float, line.split(",")), strict=True))) for line in LINES[1:]]
+
+
+class TestStream:
+    @pytest.mark.parametrize("form", ["csv", "json"])
+    def test_the_filters_numbers(self, form: str) -> None:
+        lines = [line.encode() for line in (LINES if form == "csv" else objects())]
+        found = list(ImuStream().parse(lines, "lines"))
+        np.testing.assert_allclose([one.q for one in found], [one.q for one in expected()], rtol=0, atol=1e-9)
+        assert [one.flags for one in found] == [one.flags for one in expected()]
+
+    def test_bad_lines_end_nothing(self) -> None:
+        late, cut = LINES[150], LINES[300][:20]
+        lines = [*LINES[:200], "hello", late, "{", "[1]", "\xff", cut, LINES[0], *LINES[200:]]
+        stream = ImuStream()
+        found = list(stream.parse([line.encode("latin-1") for line in lines], "lines"))
+        np.testing.assert_allclose(found[-1].q, expected()[-1].q, rtol=0, atol=1e-9)
+        assert (stream.tally.rows, stream.tally.late, stream.tally.garbled) == (len(LINES) - 1, 1, 5)
+
+
+class TestCommand:
+    def test_replay(self, adcs: Run, tmp_path) -> None:  # type: ignore[no-untyped-def]
+        (tmp_path / "log.csv").write_text("\n".join(LINES), encoding="utf-8")
+        outcome = adcs("live", "--from", f"replay:{tmp_path / 'log.csv'}", "--replay-speed", "1e9")
+        assert outcome.status == 0, outcome.err
+        rows = [json.loads(line) for line in outcome.out.splitlines()]
+        assert [*rows[0]] == [
+            *("time_s", "qw", "qx", "qy", "qz", "sigma_tilt_deg", "sigma_heading_deg", "disturbed", "flags")
+        ]
+        q = [[row[name] for name in ("qw", "qx", "qy", "qz")] for row in rows]
+        np.testing.assert_allclose(q, [one.q for one in expected()], rtol=0, atol=1e-9)
+        assert "400 rows, 0 late, 0 garbled" in outcome.err
+
+    def test_refusals(self, adcs: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+        assert_refused(adcs("live", "--lag-s", "1"), "--lag-s: found 1 s, expected 0 to 0.04 s")
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"hello\n")))
+        outcome = adcs("live", "--from", "-")
+        assert outcome.status == 2
+        assert "standard input: found only garbled lines (1; " in outcome.err.splitlines()[-1]
