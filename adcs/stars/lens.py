@@ -19,7 +19,7 @@ from arrays.io.text import read_text
 
 _ARCSEC = math.radians(1.0 / 3600.0)
 _SCALE, _BENT = 1e-3, 1e-3
-"""Least standard deviations of a lens that is used again, because of heat and focus: see LensPrior."""
+"""Least standard deviations of a reused lens, whose heat and focus may have changed: see LensPrior."""
 _KEYS = ("width_px", "height_px", "scale_arcsec", "radial", "scale_sigma_arcsec", "radial_sigma")
 
 
