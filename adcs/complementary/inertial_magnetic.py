@@ -129,7 +129,7 @@ class InertialMagneticRecord:
 def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     """Return the bias of the gyro at each instant, (n, 3) [rad/s].
 
-    It is the mean of the last 20 rests of 1.5 s. Before the first rest it is that of the first, and it is zero if the
+    It is the mean of the last 20 rests of 1.5 s. Earlier instants have the bias of the first rest. It is zero if the
     sensor never rests.
     """
     window = numbered_windows(record.time_s, _REST_S)

@@ -20,7 +20,7 @@ from arrays.typing import FloatArray
 
 _ARCSEC = math.radians(1.0 / 3600.0)
 _SCALE, _BENT = 1e-3, 1e-3
-"""Least standard deviations of a lens that is used again, because of heat and focus: see LensPrior."""
+"""Least standard deviations of a reused lens, whose heat and focus may have changed: see LensPrior."""
 _CALIBRATION, _STEPS = LensPrior(scale=0.1, bent=0.1, bent2=0.02, tangential=0.02), 6
 _Pixels = Annotated[int, Rule(lambda value: value > 0, "a positive whole number")]
 

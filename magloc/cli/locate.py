@@ -238,7 +238,7 @@ def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
             " its distance is assumed; set --body-length-m, 0 for a point source"
         )
     if fixes.caution:
-        yield f"note: {fixes.caution}, --body-length-m, 0 of a point"
+        yield f"note: {fixes.caution} with --body-length-m, 0 for a point"
     if fixes.too_near.any():
         yield (
             f"warning: in {fixes.too_near.sum()} of {n} rows the source is too near, or too large, for a dipole: the"

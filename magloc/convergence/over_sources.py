@@ -87,8 +87,8 @@ class SourcesScenario:
     moment_Am2 : float
         Size of every source's moment.
     known_moment_sigma_Am2 : float
-        Standard deviation of the moments' size, which fixes know; if infinite, all moments have the same size, and
-        fixes know nothing.
+        Standard deviation of the moments' size, a prior of the fixes; if infinite, all moments have the same size, and
+        fixes have no prior.
     body_length_m : float, optional
         Length of every source. Its multipole moments are random, and count as noise in fixes and bounds. By default a
         quarter of its distance near the array, as in :class:`magloc.Locator`; 0 for points.

@@ -155,7 +155,7 @@ class TableScenario:
             raise ValueError(f"Input drive must be one of {get_args(DriveName)}; instead received {self.drive!r}.")
         if not self.duration_s >= self.sample_s > 0.0 or not math.isfinite(self.duration_s):
             raise ValueError(
-                "Input duration_s must be finite and sample_s at least, which must be positive; "
+                "Input duration_s must be finite and not shorter than sample_s, which must be positive; "
                 f"instead received {self.duration_s} and {self.sample_s}."
             )
         if abs(self.polls * POLL_S - self.sample_s) > 1e-9:

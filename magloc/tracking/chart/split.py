@@ -10,7 +10,7 @@ Over the :math:`1/|g|^2` rows that determine the axis, but at most the n rows th
 .. math:: \beta = \frac{|c|}{1 + |g|^2} \sqrt{\min(\max(|g|^{-2}, 1), n)}
 
 standard deviations of the readings' noise. A component with :math:`\beta > \tfrac12` becomes three along that axis,
-which have the same mean and covariance together. The bent prediction of :func:`magloc.tracking.row_filter.update`
+which have the same mean and covariance together. The nonlinear prediction of :func:`magloc.tracking.row_filter.update`
 treats smaller nonlinearities. A division only approximates a Gaussian, so that needless ones lose accuracy.
 
 Principal axes of log-range and direction are not enough. If direction and moment are nearly parallel, two sources of

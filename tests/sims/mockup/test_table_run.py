@@ -205,7 +205,7 @@ class TestRefusals:
         ("changes", "text"),
         [
             ({"drive": "moon"}, "drive must be one of"),
-            ({"duration_s": 0.0}, "duration_s must be finite and sample_s at least"),
+            ({"duration_s": 0.0}, "duration_s must be finite and not shorter than sample_s"),
             ({"duration_s": math.inf}, "duration_s must be finite"),
             ({"sample_s": 0.0105}, "sample_s must be a multiple of 0.001"),
         ],
