@@ -10,8 +10,9 @@ from magloc.surveying.clock import ClockLag
 
 
 @pytest.fixture
-def without_pdf(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start no browser to print the report."""
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write blank pictures, and start no browser to print the report."""
+    monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)
     monkeypatch.setattr("magloc.deliverables.files._print_report", lambda path: None)
 
 

@@ -7,6 +7,7 @@ enlargement that the code makes for rounding is needed by some of them.
 from __future__ import annotations
 
 import math
+import os
 from fractions import Fraction
 
 import numpy as np
@@ -16,7 +17,7 @@ from adcs.ellipsoids.ellipsoid import Ellipsoid
 from adcs.ellipsoids.names import STEP_RULES
 from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
 
-N_CASES = 300
+N_CASES = 300 if os.environ.get("HYPOTHESIS_PROFILE") == "random" else 100  # all by `make test-full`
 
 
 def exact(values):

@@ -79,7 +79,7 @@ class TestTerrain:
         assert done.status == 0, done.err
         assert_depths(json.loads(done.out)["targets"])
 
-    @pytest.mark.usefixtures("without_pdf", "without_lag")
+    @pytest.mark.usefixtures("without_pictures", "without_lag")
     def test_heights_above_ground_in_the_log(self, folder: Path, tmp_path: Path, run: Run) -> None:
         """Heights of the map are those of the terrain: targets lie 0.3 to 1.5 m below the hills at 33 m."""
         raw = pytest.importorskip("pyogrio.raw")

@@ -102,7 +102,7 @@ class TestSurvey:
         assert "<Placemark>" in (tmp_path / "t.kml").read_text()
         assert "t1" in done.out
 
-    @pytest.mark.usefixtures("without_pdf")
+    @pytest.mark.usefixtures("without_pictures")
     def test_a_review_is_applied_and_written(self, folder: Path, tmp_path: Path, run: Run) -> None:
         log = tmp_path / "decisions.jsonl"
         log.write_text('{"action": "exclude", "from_s": 0, "to_s": 5}\n{"action": "split", "target": "t1"}\n')
@@ -126,7 +126,7 @@ class TestSurvey:
         assert "decisions.jsonl, targets.geojson" in without.err
         assert "are of an earlier run" in without.err
 
-    @pytest.mark.usefixtures("without_pdf")
+    @pytest.mark.usefixtures("without_pictures")
     def test_the_page_of_a_review_saves_into_the_folder(
         self, folder: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -278,7 +278,7 @@ def target(folder: Path) -> dict[str, float]:
 class TestMaps:
     """A log in UTM becomes what a client's map opens: targets in the log's system and in WGS 84."""
 
-    @pytest.mark.usefixtures("without_pdf")
+    @pytest.mark.usefixtures("without_pictures")
     def test_in_one_command(self, log: Path, target: dict[str, float], run: Run, tmp_path: Path) -> None:
         outcome = run(
             "survey", log, "--array", log.with_name("array.toml"), "--ground-m", -1, "--out", tmp_path, "--json"
