@@ -52,7 +52,7 @@ class SurfaceOptions:
     def below(
         self, logs: list[Path], parts: list[Readings], array: arrays.SensorArray, origin: Vector | None
     ) -> tuple[float | Terrain, list[Readings], Vector | None]:
-        """Return the ground with its error, the readings with heights in the world frame, and the origin of that frame.
+        """Return the ground with its error, the readings in the world frame, and its origin.
 
         Where heights of the log count from the ground, the readings and an origin without a height get those of the
         terrain.
@@ -68,6 +68,7 @@ class SurfaceOptions:
     def _surface(
         self, logs: list[Path], parts: list[Readings], array: arrays.SensorArray, origin: Vector | None
     ) -> tuple[float | Terrain, list[Readings], Vector | None]:
+        """Return the same with a ground without error."""
         if self.terrain is None:
             return self.ground_m, parts, origin
         from magloc.terrain.files import read_altitudes, read_terrain, terrain_below
