@@ -65,21 +65,21 @@ def with_likeliest_pose(model: SurveyModel, sources: Sources) -> SurveyModel:
 def with_likeliest_offsets(model: SurveyModel, sources: Sources) -> SurveyModel:
     """Return the model with the likeliest size of fields fixed to the array, for given sources.
 
-    Such a field is the heading error of a scalar sensor. Sensors whose `offset_uncertainty_T` is stated keep it.
+    Such a field is the heading error of a scalar sensor. It is not smaller than the stated `offset_uncertainty_T`.
     """
     every, array = np.arange(len(model.record)), model.record.array
     noise_T = float(np.median([sensor.noise_T for sensor in array.sensors]))
 
     def of_size(size: float) -> SurveyModel:
         sensors = (
-            replace(sensor, offset_uncertainty_T=size * noise_T)
-            if sensor.kind == "scalar" and not sensor.offset_uncertainty_T
+            replace(sensor, offset_uncertainty_T=max(sensor.offset_uncertainty_T, size * noise_T))
+            if sensor.kind == "scalar"
             else sensor
             for sensor in array.sensors
         )
         return replace(model, record=replace(model.record, array=replace(array, sensors=tuple(sensors))))
 
-    if not any(sensor.kind == "scalar" and not sensor.offset_uncertainty_T for sensor in array.sensors):
+    if not array.channel_is_scalar.any():
         return model
     models = [of_size(size) for size in _OFFSETS]
     costs = [one.misfit(sources, every) for one in models]

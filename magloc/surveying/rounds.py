@@ -158,7 +158,7 @@ class SurveyModel:
 
 
 def residuals_above(record: SurveyRecord, fit: JointFit, background: SurveyBackground) -> tuple[FloatArray, BoolArray]:
-    """Return the white residuals of groups (g, k) without the layer, and which groups are above each source (K, g)."""
+    """Return white residuals of groups (g, k), and which groups are above sources (K, g)."""
     left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(background.white.n_groups, -1)
     middles, position = record.middles_m[background.white.starts[:-1]], fit.sources.position_m
     reach = NEAR * record.height_above(position)[:, None]

@@ -181,7 +181,9 @@ def targets_of(
         covariance[j] += np.diag(square)
         low, high = interval[j] - depth[j]
         interval[j] = depth[j] + np.hypot([low, high], 1.96 * math.sqrt(square[0])) * np.sign([low, high])
-    interval = np.maximum(0.0, interval)
+    # The error of the ground shifts depths, not places.
+    half = np.hypot(interval - depth[:, None], 1.96 * record.terrain.sigma_m)
+    interval = np.maximum(0.0, depth[:, None] + half * [-1.0, 1.0])
     flags = {
         "weak": weak,
         "near": apart.min(axis=1, initial=np.inf) < NEAR * depth + 0.5,

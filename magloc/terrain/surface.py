@@ -41,6 +41,8 @@ class Terrain:
         Distance between nodes.
     name : str
         Source of the heights.
+    sigma_m : float
+        Standard deviation of the heights below the sensors; intervals of depths count it.
 
     Examples
     --------
@@ -55,6 +57,7 @@ class Terrain:
     corner_m: tuple[float, float] = (0.0, 0.0)
     cell_m: float = 1.0
     name: str = ""
+    sigma_m: float = 0.0
 
     @classmethod
     def from_points(cls, place_m: FloatArray, name: str = "") -> Terrain:

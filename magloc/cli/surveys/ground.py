@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -36,23 +36,39 @@ class SurfaceOptions:
         easting, northing, height or longitude, latitude, height, or the name of the log's column with the height above
         ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
         from the ground.
+    terrain_sigma_m : float
+        Standard deviation of the heights of the ground below the sensors [m]. Intervals of depths count it.
     """
 
     ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
     terrain: str | None = None
+    terrain_sigma_m: float = 0.0
 
     def refuse(self) -> None:
-        """Refuse a height that is not finite."""
+        """Refuse a height or an error that is not finite."""
+        refuse_outside(0.0, _HIGHEST_M, "zero or a positive number of metres", terrain_sigma_m=self.terrain_sigma_m)
         refuse_outside(-_HIGHEST_M, _HIGHEST_M, "a finite number of metres", ground_m=self.ground_m)
 
     def below(
         self, logs: list[Path], parts: list[Readings], array: arrays.SensorArray, origin: Vector | None
     ) -> tuple[float | Terrain, list[Readings], Vector | None]:
-        """Return the ground, the readings with heights in the world frame, and the origin of that frame.
+        """Return the ground with its error, the readings in the world frame, and its origin.
 
         If heights of the log count from the ground, the terrain gives the heights of the readings, and of an origin
         without one.
         """
+        ground, parts, origin = self._surface(logs, parts, array, origin)
+        if not self.terrain_sigma_m:
+            return ground, parts, origin
+        from magloc.terrain.surface import Terrain
+
+        surface = ground if isinstance(ground, Terrain) else Terrain(ground)
+        return replace(surface, sigma_m=self.terrain_sigma_m), parts, origin
+
+    def _surface(
+        self, logs: list[Path], parts: list[Readings], array: arrays.SensorArray, origin: Vector | None
+    ) -> tuple[float | Terrain, list[Readings], Vector | None]:
+        """Return the same with a ground without error."""
         if self.terrain is None:
             return self.ground_m, parts, origin
         from magloc.terrain.files import read_altitudes, read_terrain, terrain_below

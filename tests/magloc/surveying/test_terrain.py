@@ -35,6 +35,15 @@ class TestHills:
         found = magloc.survey(PAIR, flown.readings, ground_m=terrain_of(hills), prior=prior)
         assert np.abs(depth_errors(flown, found)).max() < 0.1
 
+    def test_error_of_the_ground(self) -> None:
+        """It is independent of that of the target: squares of half widths add, and 1.96 σ are 95 %."""
+        flown = walk(42, plain, 5.0, 3)
+        exact, rough = (magloc.survey(PAIR, flown.readings, ground_m=magloc.Terrain(sigma_m=s)) for s in (0.0, 0.1))
+        assert len(exact) == len(rough) > 0
+        for one, other in zip(exact, rough, strict=True):
+            wide, narrow = (t.depth_interval95_m[1] - t.depth_m for t in (other, one))
+            assert wide == pytest.approx(np.hypot(narrow, 0.196), rel=1e-9)
+
     def test_a_plane_as_a_map_is_the_plane(self) -> None:
         """The same numbers but for rounding, and the interpolation of a constant."""
         flown = walk(42, plain, 5.0, 3)
