@@ -94,7 +94,13 @@ def read_vehicle(
     ['field']
     """
     if log_reader(path) is None:
-        return VehicleFile(_text_log(path, layout, currents))
+        log = _text_log(path, layout, currents)
+        alive = tuple(one for one in log.magnetometers if _is_alive(one))
+        dead = [one.name for one in log.magnetometers if not _is_alive(one)]
+        if not alive:
+            return VehicleFile(log)
+        warnings = tuple(f"{name} has no readings that vary, and is left out" for name in dead)
+        return VehicleFile(replace(log, magnetometers=alive), warnings=warnings)
     if layout is not None:
         raise InputError(f"{path}: found a binary log with a layout (--config), expected a CSV file, or no layout.")
     return _binary_log(read_log(path), currents)
@@ -223,10 +229,14 @@ def _first_triple(log: Log, patterns: Sequence[str], what: str) -> Series:
 
 def _is_dense(series: Series) -> bool:
     """Return True for a sensor with readings often enough that are not all equal."""
-    if len(series.time_s) < _LEAST_ROWS or not np.isfinite(series.values).any():
-        return False
     often = len(series.time_s) >= _LEAST_RATE_Hz * np.ptp(series.time_s)
-    return bool(often) and bool((np.ptp(series.values, axis=0) > 0.0).any())
+    return len(series.time_s) >= _LEAST_ROWS and bool(often) and _is_alive(series)
+
+
+def _is_alive(series: Series) -> bool:
+    """Return True for a magnetometer whose readings are not all missing or equal."""
+    values = series.finite().values
+    return len(values) > 1 and bool((np.ptp(values, axis=0) > 0.0).any())
 
 
 def _varies(series: Series, least: float) -> bool:

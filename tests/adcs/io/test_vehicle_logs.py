@@ -81,6 +81,15 @@ class TestText:
         np.testing.assert_allclose(read, FLIGHT.log.magnetometers[1].values[: len(read)], atol=1e-13)
         assert file.place is None
 
+    @pytest.mark.parametrize("constant", [np.nan, 1e-5])
+    def test_magnetometer_that_is_disabled(self, tmp_path, constant):
+        dead = replace(FLIGHT.log.magnetometers[1], values=np.full_like(FLIGHT.log.magnetometers[1].values, constant))
+        log = replace(FLIGHT.log, magnetometers=(FLIGHT.log.magnetometers[0], dead))
+        write_flight(replace(FLIGHT, log=log), tmp_path / "log.csv")
+        file = adcs.read_vehicle(tmp_path / "log.csv")
+        assert [one.name for one in file.log.magnetometers] == ["field"]
+        assert file.warnings == ("mag1 has no readings that vary, and is left out",)
+
     def test_named_current_that_is_missing(self, tmp_path):
         write_flight(FLIGHT, tmp_path / "log.csv")
         with pytest.raises(arrays.InputError, match=r"the nearest is battery_A"):
