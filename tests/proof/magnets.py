@@ -220,6 +220,7 @@ def our_array(data: Path, size: Size) -> Iterator[Row]:
         )
         plain = stated(Path(name) / "plain", folder / "array.toml", SUBTRACTED)
         four = ("--sensors", ",".join(FOUR))
+        above = (*four, f"--region=z>{read_array(folder / 'array.toml').positions[:, 2].max():.4f}")
         known = (*four, "--known-moment-Am2", "0.045", "--known-moment-sigma-Am2", "0.0045")
         for case, tool, array, needs, options in (
             ("30 sensors", "locate", folder / "array.toml", "array file", ()),
@@ -227,6 +228,7 @@ def our_array(data: Path, size: Size) -> Iterator[Row]:
             ("30 sensors", "locate", plain, "array file with the background subtracted", ()),
             ("4 sensors", "locate", folder / "array.toml", "array file", four),
             ("4 sensors", "locate", plain, "array file with the background subtracted", four),
+            ("4 sensors", "locate", plain, "the same, and that the magnet is above the array", above),
             ("4 sensors", "track", folder / "array.toml", "array file", four),
             ("4 sensors", "locate", noisy, f"array file with {NOISY}, known modulus ± 10 %", known),
         ):
@@ -236,6 +238,7 @@ def our_array(data: Path, size: Size) -> Iterator[Row]:
                 + (", noise stated" if array == noisy else "")
                 + (", background subtracted" if array == plain else "")
                 + (", modulus known" if options == known else "")
+                + (", above the array" if options == above else "")
             )
             yield _row(case, label, needs, seconds / n, located(text), truth, rows)
 
