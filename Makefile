@@ -14,7 +14,7 @@ NOT_INSTALLED = { echo "magloc could not be installed: it needs the package inde
 KERNEL_SOURCES := magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against validation docs notebooks pictures chromium lint sanitize clean
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against validation proof docs notebooks pictures chromium lint sanitize clean
 .PHONY: ready compiled-tests types style style-of-kernels
 
 map: .venv/installed
@@ -98,6 +98,10 @@ bench: .venv/installed-bench
 # Tables of docs/validation repeated and compared with the page, hours in all: `make validation ONLY="Kalman bank"`.
 validation: .venv/installed-test
 	$(BIN)/python -m tests.validation $(ONLY)
+
+# Ours and other tools on the same recordings, a quarter of an hour: `make proof ONLY="broad curibio"` for some of them.
+proof: .venv/installed-bench
+	$(BIN)/python -m tests.proof $(ONLY)
 
 # Processor time against that of another revision, built beside this one: `make bench-against REV=552c0b8`, with
 # ISA=baseline for kernels confined to what every processor has.

@@ -38,7 +38,7 @@ def imported(*folders: str) -> set[str]:
     files = (path for folder in folders for path in (REPOSITORY / folder).rglob("*.py"))
     files = (path for path in files if path.name not in ("build_backend.py", "declare.py"))
     names = {name.partition(".")[0] for path in files for name in imports_of(path.read_text(encoding="utf-8"))}
-    return {DISTRIBUTIONS.get(name, name) for name in names - sys.stdlib_module_names - {*PACKAGES, "tests"}}
+    return {DISTRIBUTIONS.get(name, name) for name in names - sys.stdlib_module_names - {*PACKAGES, "docs", "tests"}}
 
 
 def imports_of(text: str) -> Iterator[str]:

@@ -33,8 +33,8 @@ def rows(size: Size) -> Iterator[Row]:
         return
     logs = [adcs.read_imu(path) for path in files]
     for what, solvers in (
-        ("in real time", {"ours": _ours(offline=False), "vqf": _vqf}),
-        ("offline", {"ours": _ours(offline=True), "vqf": _offline_vqf}),
+        ("in real time", {"ours": ours, "vqf": vqf_online}),
+        ("offline", {"ours": partial(ours, offline=True), "vqf": offline_vqf}),
     ):
         if not installed("vqf"):
             del solvers["vqf"]
@@ -48,10 +48,10 @@ def rows(size: Size) -> Iterator[Row]:
             # Seconds a trial: once is enough, and of a few of them.
             few = logs[:3]
             began = time.perf_counter()
-            found = [_madgwick(log.record) for log in few]
+            found = [madgwick(log.record) for log in few]
             once = Timing(((time.perf_counter() - began) / len(few),))
-            ours = _errors([solvers["ours"](log.record) for log in few], few)
-            note = f"{ours} in {len(few)} trials; peer {_errors(found, few)}"
+            own = _errors([ours(log.record) for log in few], few)
+            note = f"{own} in {len(few)} trials; peer {_errors(found, few)}"
             yield Row("the same", Timing(timings["ours"].seconds[:1]), "ahrs, Madgwick", once, note)
 
 
@@ -66,33 +66,31 @@ def _errors(found: list[FloatArray], logs: list[ImuLog]) -> str:
     return f"{total:.2f}°, {inclination:.2f}°"
 
 
-def _ours(*, offline: bool) -> Solver:
-    def solve(record: InertialMagneticRecord) -> FloatArray:
-        readings = record.rate_rad_s, record.acceleration_m_s2, record.field_T
-        return adcs.inertial_magnetic_filter(record.time_s, *readings, offline=offline).q
-
-    return solve
+def ours(record: InertialMagneticRecord, *, offline: bool = False) -> FloatArray:
+    """Return the attitudes of our filter."""
+    readings = record.rate_rad_s, record.acceleration_m_s2, record.field_T
+    return adcs.inertial_magnetic_filter(record.time_s, *readings, offline=offline).q
 
 
-def _readings(record: InertialMagneticRecord) -> tuple[Any, ...]:
-    """As VQF wants them."""
+def in_axes_of_vqf(record: InertialMagneticRecord) -> tuple[Any, ...]:
+    """Return the readings as VQF takes them: field in microteslas."""
     values = record.rate_rad_s, record.acceleration_m_s2, 1e6 * record.field_T
     return tuple(np.ascontiguousarray(one) for one in values)
 
 
-def _vqf(record: InertialMagneticRecord) -> FloatArray:
+def vqf_online(record: InertialMagneticRecord) -> FloatArray:
     import vqf
 
-    return np.asarray(vqf.VQF(float(np.median(record.dt_s))).updateBatch(*_readings(record))["quat9D"])
+    return np.asarray(vqf.VQF(float(np.median(record.dt_s))).updateBatch(*in_axes_of_vqf(record))["quat9D"])
 
 
-def _offline_vqf(record: InertialMagneticRecord) -> FloatArray:
+def offline_vqf(record: InertialMagneticRecord) -> FloatArray:
     import vqf
 
-    return np.asarray(vqf.offlineVQF(*_readings(record), float(np.median(record.dt_s)))["quat9D"])
+    return np.asarray(vqf.offlineVQF(*in_axes_of_vqf(record), float(np.median(record.dt_s)))["quat9D"])
 
 
-def _madgwick(record: InertialMagneticRecord) -> FloatArray:
+def madgwick(record: InertialMagneticRecord) -> FloatArray:
     """With the gain of ahrs; its first axis is north."""
     from ahrs.filters import Madgwick
 

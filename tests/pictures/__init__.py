@@ -120,6 +120,23 @@ class OfRecording:
 
 
 @dataclass(frozen=True)
+class OfTables:
+    """Drawn by ``python -m tests.proof.picture`` from the tables of a page of validation."""
+
+    page: str
+    sources: tuple[str, ...]
+
+    def steps(self) -> tuple[str, ...]:
+        text = (DOCS / "validation" / self.page).read_text(encoding="utf-8")
+        return tuple(line for line in text.splitlines() if line.startswith("| "))
+
+    def draw(self, folder: Path) -> bytes:
+        file = folder / "tables.png"
+        subprocess.run([sys.executable, "-m", "tests.proof.picture", str(file)], cwd=REPOSITORY, check=True)
+        return file.read_bytes()
+
+
+@dataclass(frozen=True)
 class Panel:
     """One panel of another picture, cut out: left, top, right and bottom [px]."""
 
@@ -239,6 +256,7 @@ PICTURES: dict[str, Picture] = {
     "background-diver.png": OfPage("background"),
     "distance-of-a-coil.png": OfPage("single-sensor-ranging"),
     "gradient-tensor.png": OfPage("gradient-tensor"),
+    "same-data.png": OfTables("same-data.md", ("tests/proof/picture.py",)),
     "beating-tissue.png": OfRecording("docs.studies.beating_tissue", ("docs/studies/beating_tissue.py",)),
     "stars-identified.png": OfPage("star-identification"),
     "view-array.png": OfCommands(

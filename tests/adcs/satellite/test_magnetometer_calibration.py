@@ -6,7 +6,6 @@ from the prior, and a recording of the International Space Station.
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -19,12 +18,11 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import chi2
 
 from adcs import Telemetry, calibrate_magnetometer, quaternion
-from adcs.environment.environment import environment, field_eci
-from adcs.frames import R_ecef_from_eci, R_orbital_from_eci
+from adcs.environment.environment import environment
 from adcs.satellite import magnetometer_calibration as module
 from adcs.satellite.magnetometer_calibration import MagnetometerCalibration, MagnetometerPrior, calibrate_readings
-from magloc.fields import geomagnetic
 from tests.adcs.filter_runs import tabletsat
+from tests.proof.station import station_track
 
 Array = NDArray[np.float64]
 PRIOR = MagnetometerPrior(time_shift_s=5.0)
@@ -207,20 +205,7 @@ class TestRows:
 @pytest.fixture(scope="module")
 def station(data_folder: Path) -> tuple[Array, Array, Array, Array]:
     """Times, readings, and times and field along the track."""
-    with (data_folder / "iss-magnetometer" / "commissioning_2022-01-31.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    utc = np.array([row["Date/Time"].replace(" ", "T") for row in rows], dtype="datetime64[us]")
-    time_s = (utc - utc[0]) / np.timedelta64(1, "s")
-    latitude, longitude = (np.array([float(row[key]) for row in rows]) for key in ("Latitude", "Longitude"))
-    readings = 1e-6 * np.array([[float(row[key]) for key in ("MagX", "MagY", "MagZ")] for row in rows])
-    ecef = geomagnetic.ecef_from_geodetic(latitude, longitude, 420e3)
-    eci = (R_ecef_from_eci(utc).mT @ ecef[..., None])[..., 0]
-    # Every half minute: positions have three decimals of a degree, which a derivative would not forgive.
-    track, at = CubicSpline(time_s[::6], eci[::6]), np.arange(0.0, time_s[-1], 10.0)
-    position, velocity = track(at), track(at, 1)
-    field = field_eci(position, utc[0] + (1e6 * at).astype("timedelta64[us]"))
-    to_orbital = R_orbital_from_eci(position, velocity)
-    return time_s, readings, at, (to_orbital @ field[..., None])[..., 0]
+    return station_track(data_folder)
 
 
 class TestRecording:
