@@ -95,6 +95,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "map --html out.html",
     ),
     "magloc new-array": ("out.toml --shape tetrahedron --size-m 1.5 --noise-nT 1",),
+    "magloc export-config": ("array.toml --to header", "array.toml --out out.hpp"),
     "magloc columns": ("readings.csv", "readings.csv --out out.toml", "magarrow.csv --instrument magarrow"),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
@@ -125,7 +126,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "imu.csv --config imu.toml --html out.html",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
-    "adcs live": ("--from - --config imu.toml", "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01"),
+    "adcs live": ("--from replay:imu.csv --replay-speed 1e6 --config imu.toml", "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01"),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": (
