@@ -126,7 +126,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "imu.csv --config imu.toml --html out.html",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
-    "adcs live": ("--from replay:imu.csv --replay-speed 1e6 --config imu.toml", "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01"),
+    "adcs live": (
+        "--from replay:imu.csv --replay-speed 1e6 --config imu.toml",
+        "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01",
+    ),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": (
