@@ -67,6 +67,7 @@ CASES = {
     "magloc design": Case("task.toml --out out.toml"),
     "magloc view": Case("readings.csv --array array.toml --html out.html", 1000, files=("readings.csv",)),
     "magloc new-array": Case("out.toml --shape tetrahedron --size-m 1.5 --noise-nT 1"),
+    "magloc export-config": Case("array.toml --out out.hpp"),
     "magloc columns": Case("readings.csv", 3000, files=("readings.csv",)),
     "magloc demo": Case("out"),
     "magloc warm-up": Case(""),

@@ -104,6 +104,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "robot.ulg --out out.toml",
         "robot.ulg --rest out",
     ),
+    "magloc export-config": ("array.toml --to header", "array.toml --out out.hpp"),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
     "adcs demo": ("out",),
@@ -133,7 +134,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "imu.csv --config imu.toml --html out.html",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
-    "adcs live": ("--from - --config imu.toml", "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01"),
+    "adcs live": (
+        "--from replay:imu.csv --replay-speed 1e6 --config imu.toml",
+        "--from replay:imu.csv --replay-speed 1e6 --lag-s 0.01",
+    ),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out", "robot.ulg --json"),
     "adcs calibrate-log": (
         "imu.csv --config imu.toml --out out.toml --json",

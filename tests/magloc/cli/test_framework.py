@@ -37,6 +37,7 @@ COMMANDS = (
     "bounds",
     "design",
     "new-array",
+    "export-config",
     "columns",
     "qc",
     "survey",
