@@ -198,7 +198,12 @@ def calibrate_log(
     if field_T is not None and np.shape(field_T) != (3,):
         raise ValueError(f"Input field_T must have shape (3,); instead received {np.shape(field_T)}.")
     field = FieldPrior() if field_T is None else FieldPrior.of(np.asarray(field_T, np.float64), field_error_T)
-    fit = fit_log(log, field)
+    try:
+        fit = fit_log(log, field)
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "Input log must have readings that fit one motion; instead received others. Check units."
+        ) from None
     problem = fit.estimate.problem
     ranges = np.array([max(float(np.ptp(one.values)), 1e-6) for one in problem.currents])
     terms = terms_of(

@@ -11,7 +11,7 @@ import numpy as np
 from adcs.log_calibration.arrow import ArrowSystem, Solution
 from adcs.log_calibration.linear import LinearModel
 from adcs.log_calibration.parameters import GYRO_BIAS, INCLINATION, MODULUS, FieldPrior, Layout
-from adcs.log_calibration.record import InertialData, VehicleLog
+from adcs.log_calibration.record import FEWEST_ROWS, InertialData, VehicleLog
 from adcs.log_calibration.start import find_start
 from adcs.log_calibration.system import Estimate, Noise, Problem, slow_field
 from arrays.typing import BoolArray, FloatArray
@@ -203,4 +203,9 @@ def _used_rows(at: Estimate, m: int, noise: Noise, disturbed: BoolArray) -> Bool
     used = np.zeros(len(at.problem.magnetometers[m].time_s), np.bool_)
     fits = np.sum(rows.residual**2, axis=1) < _OUTLIER * noise.white_uT[m] ** 2
     used[rows.which] = fits & ~disturbed[rows.interval] & ~at.problem.inertial.in_gap[rows.interval]
+    if used.sum() < FEWEST_ROWS:
+        raise ValueError(
+            f"Input magnetometers must have ten readings that fit, outside gaps of the gyro; instead received"
+            f" {used.sum()} of {at.problem.magnetometers[m].name}."
+        )
     return used

@@ -10,7 +10,7 @@ from adcs.complementary.inertial.gaps import sensor_gaps
 from adcs.satellite.vector_record import GyroSamples, step_rates, steps_s
 from arrays.typing import BoolArray, FloatArray, IntArray
 
-SHORTEST_S = 2.0
+SHORTEST_S, FEWEST_ROWS = 2.0, 10
 _KNOT_S, _MOST_KNOTS = 2.0, 1500
 _LONGEST_GAP_S = 0.25
 
@@ -96,6 +96,24 @@ class VehicleLog:
             )
         if not self.magnetometers:
             raise ValueError("Input magnetometers must name one magnetometer at least; instead received none.")
+        _check_size("gyro_rad_s", self.gyro_rad_s, 0.0, 50.0, "rad/s")
+        _check_size("acceleration_m_s2", self.acceleration_m_s2, 1.0, 100.0, "m/s²")
+        for one in self.magnetometers:
+            _check_size(f"{one.name}", one.values, 1e-7, 1e-2, "T")
+        for one in self.currents:
+            if np.isfinite(one.values).sum() < 2:
+                raise ValueError(f"Input {one.name} must have two values at least; instead received fewer.")
+
+
+def _check_size(name: str, values: FloatArray, least: float, most: float, unit: str) -> None:
+    """Refuse vectors (n, 3) whose typical length no sensor has."""
+    known = values[np.isfinite(values).all(axis=1)]
+    size = float(np.median(np.linalg.norm(known, axis=1))) if len(known) else least
+    if not least <= size <= most:
+        raise ValueError(
+            f"Input {name} must have a median length of {least:g} to {most:g} {unit}; instead received {size:.3g}"
+            f" {unit}. Check its unit."
+        )
 
 
 @dataclass(frozen=True, eq=False)

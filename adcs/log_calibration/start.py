@@ -11,7 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from adcs import quaternion
 from adcs.complementary.inertial.integration import gyro_attitudes, level_attitudes
-from adcs.log_calibration.record import InertialData, Series
+from adcs.log_calibration.record import FEWEST_ROWS, InertialData, Series
 from arrays.typing import FloatArray, IntArray
 
 _LEVEL_S = 10.0
@@ -129,7 +129,7 @@ def _sampled(data: InertialData, series: Series) -> tuple[IntArray, FloatArray]:
     begin = t[int(np.argmax(turns[later] - turns))]
     inside = (series.time_s >= max(begin, t[0])) & (series.time_s <= min(begin + _WINDOW_S, t[-1]))
     rows = np.flatnonzero(inside)
-    if len(rows) < 10:
+    if len(rows) < FEWEST_ROWS:
         raise ValueError(
             f"Input magnetometers must have ten readings during the inertial readings; instead received {len(rows)} of"
             f" {series.name}."

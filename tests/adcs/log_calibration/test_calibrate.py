@@ -158,6 +158,8 @@ class TestFaults:
             ({"magnetometers": ()}, "must name one magnetometer"),
             ({"gyro_rad_s": np.zeros((3, 3))}, "gyro_rad_s must have shape"),
             ({"time_s": np.linspace(0.0, 1.0, 1000)}, "must span 2 s"),
+            ({"acceleration_m_s2": np.zeros((1000, 3))}, "median length of 1 to 100 m/s"),
+            ({"gyro_rad_s": np.full((1000, 3), 500.0)}, "Check its unit"),
         ],
     )
     def test_refusals(self, change, words):
