@@ -52,7 +52,7 @@ def calibrate_log(
     common : QuietOptions
         Common options.
     """
-    from adcs.io.autopilot_files import axes_warning, writer_of
+    from adcs.log_calibration.autopilot_files import axes_warning, writer_of
 
     refuse_one_for_two({"LOG": log, "--out": out})
     refuse_unwritable(out, "--out")

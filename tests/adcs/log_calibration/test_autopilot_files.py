@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import arrays
-from adcs.io.autopilot_files import ardupilot_parameters, px4_parameters, writer_of
+from adcs.log_calibration.autopilot_files import ardupilot_parameters, px4_parameters, writer_of
 from sims.attitude.flights import FlightSettings
 from tests.adcs.log_calibration.flights import FIELD_T, calibrated
 
