@@ -301,7 +301,7 @@ def refuse_unfinished(progress: TurningProgress | None, source: str) -> None:
     """Raise an error if a stream ended before the calibration was enough."""
     if progress is None:
         raise InputError(
-            f"{source}: found no {_FEWEST} rows in different directions, expected sensors that are turned."
+            f"{source}: found fewer than {_FEWEST} directions of the field, expected sensors that are turned."
         )
     if not progress.enough:
         covered = min(sensor.coverage for sensor in progress.sensors)

@@ -24,6 +24,8 @@ from magloc.readings import write_readings
 from sims.experiments.loads import switching_loads
 from tests.adcs.stars.test_identification import random_sky, write_frames
 from tests.magloc.compensation.flights import Flight, Platform, array_of
+from tests.magloc.live.test_turning import board as turned_board
+from tests.magloc.live.test_turning import turned as turned_rows
 from tests.robot_flights import Flight as RobotFlight
 
 APPS = {"magloc": magloc_app, "adcs": adcs_app}
@@ -74,7 +76,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "--array array.toml --from - --speed-m-s 0.1",
         "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3 --out out.csv",
         "--array log.toml --from replay:log.csv --replay-speed 1e6",
-        "--array array.toml --from replay:readings.csv --replay-speed 1e6 --calibrate --out-array out.toml",
+        "--array turned.toml --from replay:turned.csv --replay-speed 1e6 --calibrate --out-array out.toml",
     ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
@@ -354,6 +356,9 @@ def write_files(folder: Path) -> None:
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
     _write_flight(folder)
+    board = turned_board()
+    arrays.write_array(folder / "turned.toml", board)
+    write_readings(folder / "turned.csv", turned_rows(250), board)
     flight = switching_loads(rng=0, duration_s=150.0)
     write_columns(flight.columns, folder / "loads.csv")
     arrays.write_array(folder / "loads.toml", flight.array)

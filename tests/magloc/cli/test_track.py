@@ -268,7 +268,12 @@ class TestTruth:
 
     def test_of_other_times(self, run: Run, array: Path, readings: Path, tmp_path: Path) -> None:
         late = write(tmp_path / "late.csv", ["time_s,x_m,y_m,z_m", "1000,1,2,3", "1001,1,2,3"])
-        assert_refused(run("track", readings, "--array", array, "--truth", late), str(late), "same time_s")
+        assert_refused(
+            run("track", readings, "--array", array, "--truth", late),
+            str(late),
+            "none of the times",
+            "by the same clock",
+        )
 
 
 class TestTruthBetweenItsRows:

@@ -218,7 +218,7 @@ class TestOffset:
     def test_what_has_no_cure_is_asked(self) -> None:
         another_axis = self.YAW * Rotation.from_euler("Y", 1.0)
         said = self.said(0.0, another_axis)
-        assert "is the attitude that" in said
+        assert "does the attitude rotate the array's frame to the world's" in said
         assert "are the sensors calibrated?" in said
         assert not self.said(0.0, another_axis, uncertainty_T=30e-6)
 
