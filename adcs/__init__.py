@@ -22,6 +22,8 @@ __getattr__, __dir__, __all__ = lazy_names(
         "MagnetometerPrior": "adcs.satellite.magnetometer_calibration",
         "OwnFields": "adcs.satellite.own_fields",
         "Satellite": "adcs.satellite.satellite",
+        "SatelliteEstimate": "adcs.kalman.satellite_filter",
+        "SatelliteFilter": "adcs.kalman.satellite_filter",
         "Telemetry": "adcs.satellite.telemetry",
         "VectorAttitudes": "adcs.satellite.wahba",
         "VehicleLog": "adcs.log_calibration.record",

@@ -22,6 +22,8 @@ from adcs.io.telemetry_files import read_telemetry as read_telemetry
 from adcs.io.vehicle_logs import read_vehicle as read_vehicle
 from adcs.kalman.bank import EstimatorSettings as EstimatorSettings
 from adcs.kalman.bank import estimate as estimate
+from adcs.kalman.satellite_filter import SatelliteEstimate as SatelliteEstimate
+from adcs.kalman.satellite_filter import SatelliteFilter as SatelliteFilter
 from adcs.log_calibration.calibrate import LogCalibration as LogCalibration
 from adcs.log_calibration.calibrate import calibrate_log as calibrate_log
 from adcs.log_calibration.record import VehicleLog as VehicleLog

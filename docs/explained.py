@@ -74,7 +74,8 @@ EXPLAINED = {
     " sims.experiments.switching_loads",
     "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.read_imu adcs.HeadingModel"
     " adcs.Gains",
-    "own-hardware": "adcs.AttitudeFilter adcs.AttitudeConfig adcs.AttitudeEstimate",
+    "own-hardware": "adcs.AttitudeFilter adcs.AttitudeConfig adcs.AttitudeEstimate adcs.SatelliteFilter"
+    " adcs.SatelliteEstimate",
     "star-identification": "adcs.solve_photograph adcs.identify_stars adcs.read_picture adcs.combined_star_fixes"
     " adcs.hipparcos_catalogue",
     "table-top-satellite": "adcs.mockup sims.table_run sims.TableScenario sims.CameraErrors sims.rendered_frame"

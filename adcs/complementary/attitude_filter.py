@@ -5,9 +5,7 @@ The filter is C++, `magloc/core/include/adcs/attitude_filter.hpp`; a microcontro
 
 from __future__ import annotations
 
-import base64
 import math
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
@@ -24,6 +22,7 @@ from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.values import numbers
 from arrays.typing import BoolArray, FloatArray
 from magloc import core
+from magloc.saved_states import read_sealed, seal
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -263,15 +262,13 @@ class AttitudeFilter:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the filter, for a JSON file and :meth:`from_state`."""
-        content = self._state.tobytes()
-        return {
-            "version": _VERSION,
-            "config": asdict(self.config),
-            "last_s": self._last_s if math.isfinite(self._last_s) else None,
-            "is_started": bool(self._work.struct.resume),
-            "crc32": zlib.crc32(content),
-            "content": base64.b64encode(content).decode(),
-        }
+        return seal(
+            _VERSION,
+            self._state.tobytes(),
+            config=asdict(self.config),
+            last_s=self._last_s if math.isfinite(self._last_s) else None,
+            is_started=bool(self._work.struct.resume),
+        )
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> AttitudeFilter:
@@ -282,23 +279,18 @@ class AttitudeFilter:
         ValueError
             The state has another version, or is damaged.
         """
-        version = state.get("version")
-        if version != _VERSION:
-            raise ValueError(f"Input state must have version {_VERSION}; instead received {version!r}.")
-        try:
+
+        def read(content: bytes) -> AttitudeFilter:
             config = dict(state["config"])
             found = cls(AttitudeConfig(**{**config, "model": HeadingModel(**config["model"])}))
-            content = base64.b64decode(state["content"], validate=True)
-            is_whole = len(content) == found._state.nbytes and zlib.crc32(content) == state["crc32"]
-            last_s, is_started = state["last_s"], bool(state["is_started"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"Input state must be one of AttitudeFilter.state(); {error!r} contradicts it.") from error
-        if not is_whole:
-            raise ValueError("Input state must be whole; instead its content does not match its length or checksum.")
-        found._state[:] = np.frombuffer(content, dtype=np.float64)
-        found._last_s = -math.inf if last_s is None else float(last_s)
-        found._work.struct.resume = int(is_started)
-        return found
+            if len(content) != found._state.nbytes:
+                raise ValueError(f"its length {len(content)}")
+            last_s, found._work.struct.resume = state["last_s"], int(bool(state["is_started"]))
+            found._state[:] = np.frombuffer(content, dtype=np.float64)
+            found._last_s = -math.inf if last_s is None else float(last_s)
+            return found
+
+        return read_sealed(state, _VERSION, "AttitudeFilter", read)
 
     @property
     def _state_memory(self) -> Any:

@@ -178,14 +178,16 @@ MAGLOC_KERNEL(mekf_runs, mekf) {
   const FilterModel model = model_of(p, p.has_feedback ? &feedback : nullptr);
   Gate gate = {p.gate_limit, {}, p.open_variance};
   for (int k = 0; k < Sensor::count; ++k) gate.patience[k] = p.patience[k];
+  const int64_t first = p.n_before > 0 ? p.n_before - 1 : 0;
   for (int64_t row = begin; row < end; ++row) {
     const int64_t run = row / p.n_instants, i = row % p.n_instants, step = (i - 1) * model.n;
     const Instant now = instant_at(p, row);
+    if (i == 0 && p.n_before > 0) continue;
     if (i == 0)
       start(p, model, run, *filter);
     else
       filter->predict(model, instant_at(p, row - 1), now, p.kept + step, p.added_variance + step, p.dt[i - 1]);
-    filter->update(model, gate, now, readings_at(p, row), i, p.nis + 4 * row, p.log_determinant + 4 * row,
+    filter->update(model, gate, now, readings_at(p, row), first + i, p.nis + 4 * row, p.log_determinant + 4 * row,
                    p.rejected + 4 * row);
     store(filter->main(), model, row, p);
   }

@@ -313,6 +313,21 @@ def run_filter(
     ValueError if the start does not have as many runs as the record.
     """
     check_start(record, start)
+    work, tracks = filter_problem(record, settings, start, closed_loop_F=closed_loop_F)
+    runs, n = record.momentum_Nms.shape[:2]
+    block = _COVARIANCES_A_CALL // settings.sensors.size**2
+    core.run("mekf_runs", work, runs * n, block=block, chain=n * max(1, block // max(1, n)))
+    return tracks
+
+
+def filter_problem(
+    record: Record, settings: FilterSettings, start: FilterStart, *, closed_loop_F: bool = False, n_before: int = 0
+) -> tuple[core.Problem, AttitudeTracks]:
+    """Return the description of a filter to the kernel ``mekf_runs``, and the tracks that the kernel fills.
+
+    ``n_before``: instants that the filter of one run in the kernel's workspace has taken. Above 0, the record begins
+    with the last of them, and the start is not used.
+    """
     used, around, readings = settings.sensors, record.environment, record.readings
     first, sigma = initial_state(settings, start), deviations(record, settings)
     runs, n = record.momentum_Nms.shape[:2]
@@ -373,15 +388,13 @@ def run_filter(
         nis=nis,
         log_determinant=log_det,
         rejected=rejected.view(np.uint8),
+        n_before=n_before,
         **{name: np.ascontiguousarray(values, dtype=np.float64) for name, values in inputs.items()},
     )
-    work = core.problem("mekf", **fields)
-    block = _COVARIANCES_A_CALL // used.size**2
-    core.run("mekf_runs", work, runs * n, block=block, chain=n * max(1, block // max(1, n)))
     parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
-    return AttitudeTracks(
-        settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected, log_det
-    )
+    by_state = dict(zip(used.states, parts, strict=False))
+    tracks = AttitudeTracks(settings, q, w, by_state, covariance, nis, rejected, log_det)
+    return core.problem("mekf", **fields), tracks
 
 
 def patience(sensor: int, dt_s: float) -> int:

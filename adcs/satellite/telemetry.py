@@ -272,13 +272,15 @@ class Telemetry:
             for rows in np.split(np.arange(len(self.time_s)), cuts)
         ]
 
-    def record(self, satellite: Satellite) -> Record:
+    def record(self, satellite: Satellite, since_s: float | None = None) -> Record:
         """Return the input of the filters: readings at each instant, field and Sun along the orbit.
 
         Parameters
         ----------
         satellite : Satellite
             Orbit, field model and noise of the star tracker.
+        since_s : float, optional
+            Time from which instants are rounded to microseconds; by default the first of the log.
 
         Returns
         -------
@@ -286,7 +288,7 @@ class Telemetry:
             Record of one run, with all instants.
         """
         instants_s, rows = _filter_instants(self.time_s, self.step_s)
-        n, start_s = len(instants_s), self.time_s[0]
+        n, start_s = len(instants_s), self.time_s[0] if since_s is None else since_s
 
         def spread(values: FloatArray) -> FloatArray:
             """Return values at all instants, NaN in gaps."""
@@ -379,7 +381,8 @@ def usual_step_s(time_s: FloatArray) -> float:
 def _filter_instants(time_s: FloatArray, step_s: float) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return the instants of a filter, and the indices of the n times among them."""
     rows, off = steps_of(time_s, step_s)
-    if not off.any() and (np.diff(rows) > 0).all():
+    # Two times alone show no grid; a filter of single readings keeps them as they are.
+    if len(time_s) > 2 and not off.any() and (np.diff(rows) > 0).all():
         return time_s[0] + step_s * np.arange(int(rows[-1]) + 1), rows
     counts = np.maximum(np.ceil(np.diff(time_s) / step_s - 0.5), 1.0).astype(np.int64)
     rows = np.concatenate([[0], np.cumsum(counts)])

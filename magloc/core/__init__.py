@@ -129,9 +129,12 @@ def run(
         Number of items that depend on each other, such as the steps of a filter. One thread computes them in order, and
         the workspace is the same for all of them.
     workspace : optional
-        Of :func:`new_workspace`, where there is one chain or block; by default a new one.
+        Of :func:`new_workspace`, or an array of as many doubles, where there is one chain or block; by default a new
+        one.
     """
     function = getattr(_lib, f"magloc_{kernel}")
+    if isinstance(workspace, np.ndarray):
+        workspace = ffi.from_buffer("double[]", workspace)
     if 0 < n <= block:
         function(work.struct, 0, n, new_workspace(kernel, work) if workspace is None else workspace)
         return

@@ -283,6 +283,8 @@ typedef struct {
   double *covariance;            /* (n_runs, n_instants, n_states, n_states) */
   double *nis, *log_determinant; /* (n_runs, n_instants, 4), left as they are without a reading */
   uint8_t *rejected;             /* (n_runs, n_instants, 4), likewise */
+  int64_t n_before;              /* of one run that goes on: instants so far, the last of them is instant 0 here and the
+                                    workspace has the filter after it; else 0 */
 } magloc_mekf;
 int64_t magloc_mekf_runs(const magloc_mekf *problem, int64_t begin, int64_t end, double *workspace);
 /* Ends of a filter from many starts, which are states (position, moment) of a dipole; an item is a start.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import collections
 import io
 import pickle
@@ -12,6 +11,8 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+
+from magloc.saved_states import read_sealed, seal
 
 VERSION = 1
 """Version of the states; it changes with the classes that a tracker holds."""
@@ -41,8 +42,7 @@ class _Unpickler(pickle.Unpickler):
 
 def saved_state(values: Mapping[str, object]) -> dict[str, Any]:
     """Return values as a state: a version, a checksum and text."""
-    content = zlib.compress(pickle.dumps(dict(values), protocol=5))
-    return {"version": VERSION, "crc32": zlib.crc32(content), "content": base64.b64encode(content).decode()}
+    return seal(VERSION, zlib.compress(pickle.dumps(dict(values), protocol=5)))
 
 
 def values_of_state(state: Mapping[str, Any]) -> dict[str, Any]:
@@ -53,12 +53,6 @@ def values_of_state(state: Mapping[str, Any]) -> dict[str, Any]:
     ValueError
         The state has another version, is damaged, or is no state of a tracker.
     """
-    if (version := state.get("version")) != VERSION:
-        raise ValueError(f"Input state must have version {VERSION}; instead received {version!r}.")
-    try:
-        content = base64.b64decode(state["content"], validate=True)
-        if zlib.crc32(content) != state["crc32"]:
-            raise ValueError("its checksum differs")
-        return dict(_Unpickler(io.BytesIO(zlib.decompress(content))).load())
-    except (KeyError, TypeError, ValueError, EOFError, zlib.error, pickle.UnpicklingError, ImportError) as error:
-        raise ValueError(f"Input state must be one of Tracker.state(); instead {error} contradicts it.") from error
+    return read_sealed(
+        state, VERSION, "Tracker", lambda content: dict(_Unpickler(io.BytesIO(zlib.decompress(content))).load())
+    )

@@ -126,8 +126,8 @@ class TestState:
         state = AttitudeFilter().state()
         for change, words in (
             ({"version": 2}, "must have version 1; instead received 2"),
-            ({"crc32": 7}, "does not match its length or checksum"),
-            ({"content": state["content"][:80]}, "does not match its length or checksum"),
+            ({"crc32": 7}, "its checksum differs"),
+            ({"content": state["content"][:80]}, "its checksum differs"),
             ({"content": "?"}, r"must be one of AttitudeFilter.state\(\)"),
             ({"config": {"magnet": "left", "model": {}}}, r"must be one of AttitudeFilter.state\(\)"),
         ):
