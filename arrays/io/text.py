@@ -11,6 +11,7 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from arrays.io.closing import delay_signals
 from arrays.io.errors import InputError, of_extra
 
 if TYPE_CHECKING:
@@ -125,6 +126,14 @@ def check_netcdf() -> None:
 
 
 def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
-    """Write a netCDF file, completely or not at all."""
+    """Write a netCDF file, completely or not at all; a signal acts after it.
+
+    A signal that is raised while xarray takes its lock of HDF5 would leave it locked, and closing the file would hang.
+    """
     check_netcdf()
-    replace_file(path, lambda unfinished: dataset.to_netcdf(unfinished))
+
+    def write(unfinished: Path) -> None:
+        with delay_signals():
+            dataset.to_netcdf(unfinished)
+
+    replace_file(path, write)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from arrays.io import text
 from arrays.io.csv import read_table
 from arrays.io.errors import InputError
-from arrays.io.text import read_bytes, read_text
+from arrays.io.text import read_bytes, read_text, write_netcdf
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes in the file system, and devices")
 
@@ -86,3 +87,20 @@ class TestEncodings:
         (tmp_path / "log.csv").write_bytes(self.TEXT.encode("windows-1252"))
         with pytest.raises(InputError, match=r"log.csv, line 1: found the byte 0xf6, which is not UTF-8"):
             read_text(tmp_path / "log.csv", "a CSV file")
+
+
+class TestNetcdf:
+    def test_a_signal_acts_after_the_file_is_written(self, tmp_path: Path) -> None:
+        """Raised inside xarray, it would leave the lock of HDF5 locked; what is unfinished is removed."""
+        written = []
+
+        class Dataset:
+            def to_netcdf(self, path: Path) -> None:
+                signal.raise_signal(signal.SIGINT)
+                path.write_bytes(b"whole")
+                written.append(path)
+
+        with pytest.raises(KeyboardInterrupt):
+            write_netcdf(Dataset(), tmp_path / "run.nc")  # type: ignore[arg-type]
+        assert written
+        assert list(tmp_path.iterdir()) == []
