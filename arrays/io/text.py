@@ -131,9 +131,5 @@ def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
     A signal that is raised while xarray takes its lock of HDF5 would leave it locked, and closing the file would hang.
     """
     check_netcdf()
-
-    def write(unfinished: Path) -> None:
-        with delay_signals():
-            dataset.to_netcdf(unfinished)
-
-    replace_file(path, write)
+    with delay_signals():
+        replace_file(path, lambda unfinished: dataset.to_netcdf(unfinished))
