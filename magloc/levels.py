@@ -68,3 +68,6 @@ contradictions end a track."""
 DISAGREEMENT = 1e-3
 """Probability of the χ² of the offset between successive proposals for a start, below which they disagree. A later
 start costs only a row."""
+
+SIGMA_OF_MAD = 1.4826
+"""Standard deviation of normal numbers, over the median of their absolute deviations."""

@@ -26,6 +26,7 @@ from arrays.io.errors import check_not_negative, check_positive
 from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray
 from magloc.least_squares import damped_step, minimise
+from magloc.levels import SIGMA_OF_MAD
 
 Attitude = Literal["none", "orbital"]
 """Known attitude: none, or constant in the frame of the model's field."""
@@ -406,7 +407,7 @@ def _maximise_posterior(
 def _outliers(residual: FloatArray, prior: MagnetometerPrior) -> BoolArray:
     """Return rows (n,) beyond :data:`OUTLIER` times the stated noise and times the spread of the rows."""
     size = np.abs(residual).reshape(len(residual), -1).max(axis=1)
-    spread = 1.4826 * float(np.median(np.abs(residual)))
+    spread = SIGMA_OF_MAD * float(np.median(np.abs(residual)))
     return size > OUTLIER * max(spread, math.hypot(prior.noise_T, prior.field_error_T))
 
 

@@ -29,6 +29,7 @@ from arrays.array import SensorArray
 from arrays.io.errors import check_positive
 from arrays.io.results import Drawn
 from arrays.typing import BoolArray, FloatArray
+from magloc.levels import SIGMA_OF_MAD
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
 
@@ -320,7 +321,7 @@ def _whole_lag(times: FloatArray, fields: FloatArray, turns: FloatArray, s: Floa
     jumps = jumps[:, np.isfinite(jumps).any(axis=0)]
     if not jumps.size:
         return StateLag(0, 0, step_s, is_known=False)
-    jumps /= np.maximum(1.4826 * np.nanmedian(np.abs(jumps), axis=0), 1e-12)
+    jumps /= np.maximum(SIGMA_OF_MAD * np.nanmedian(np.abs(jumps), axis=0), 1e-12)
     longest = int(min(LONGEST_LAG_S / step_s, len(times)))
     lags = np.arange(-longest, longest + 1)
     explained = np.zeros(len(lags))

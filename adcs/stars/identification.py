@@ -20,6 +20,7 @@ from adcs.stars.catalogue import WHOLE_SKY, SkyCap, StarCatalogue
 from adcs.stars.pose import CameraPose, LensPrior, fit_pose
 from adcs.stars.triangles import AttitudeHypothesis, Checks, RankedTriangles, TriangleIndex, star_triangles
 from arrays.typing import FloatArray, IntArray
+from magloc.levels import SIGMA_OF_MAD
 
 # Number of brighter neighbours with which a star forms triangles, in the catalogue and in an image with hot pixels.
 _BRIGHTER, _IMAGE_BRIGHTER = 4, 8
@@ -288,7 +289,7 @@ class StarMatcher:
         row, distance = row[star, of_star], distance[star, of_star] / (gate / 3.0)
         fainter = magnitudes[star] - self.catalogue.magnitudes[row]
         nearest = fainter[of_star == 0]
-        spread = max(1.4826 * float(np.median(np.abs(nearest - np.median(nearest)))), _LEAST_SPREAD)
+        spread = max(SIGMA_OF_MAD * float(np.median(np.abs(nearest - np.median(nearest)))), _LEAST_SPREAD)
         # Magnitudes in other colours and noise have tails: Student's t with two degrees of freedom.
         cost = distance**2 + 3.0 * np.log1p(0.5 * ((fainter - np.median(nearest)) / spread) ** 2)
         # Each star keeps its best row and each row its best star, unless another one is nearly as good.

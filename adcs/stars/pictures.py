@@ -21,6 +21,7 @@ from scipy import ndimage
 from arrays.io.errors import InputError
 from arrays.io.text import read_bytes
 from arrays.typing import BoolArray, FloatArray
+from magloc.levels import SIGMA_OF_MAD
 
 SUFFIXES = (".png", ".tif", ".tiff", ".fits", ".fit", ".jpg", ".jpeg")
 _BLOCK_PX = 32
@@ -31,7 +32,6 @@ _THRESHOLD_SIGMAS = 5.0
 _HOT_SHARE = 0.85  # share of a light in one pixel above which it is a hot pixel
 _HALF_WINDOW = 3
 _WEIGHT_PX, _ROUNDS = 1.2, 6  # width of the weight of centroids, and number of iterations
-_SIGMA_OF_MAD = 1.4826
 _MOST_PIXELS = 10**8
 _LEAST_FINITE = 0.5  # share of the pixels of a picture or a block
 _FITS_BLOCK, _FITS_CARD = 2880, 80
@@ -232,7 +232,7 @@ def _deviation(least: float) -> Callable[[FloatArray], float]:
 
     def deviation(block: FloatArray) -> float:
         distance = np.abs(block - np.median(block))
-        usual = max(_SIGMA_OF_MAD * float(np.median(distance)), least)
+        usual = max(SIGMA_OF_MAD * float(np.median(distance)), least)
         return max(math.sqrt(float(np.mean(distance[distance <= 5.0 * usual] ** 2))), least)
 
     return deviation

@@ -18,6 +18,7 @@ from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
 from magloc.deliverables.lag import clock_lag, without_ambient
+from magloc.levels import SIGMA_OF_MAD
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.measurement.plausibility import EARTH_T, finite_median
 from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
@@ -38,7 +39,6 @@ _SIGNIFICANT = 3.0  # standard deviations of the lag and of the heading error
 _WIDE = 1.7  # times the spacing of lines
 _NEAR = 0.75  # distance of a covered place from a line, in spacings
 _FOURTH = math.sqrt(70.0)  # standard deviation of the fourth difference of white noise
-_GAUSSIAN = 1.4826  # standard deviation over the median of absolute values
 _CELLS_PER_SPACING, _MOST_CELLS = 10.0, 200_000
 _SHORTEST_GEOLOGY_M = 15.0
 
@@ -382,7 +382,7 @@ def _fourth_differences(time_s: FloatArray, values: FloatArray) -> FloatArray:
 
 def _spread(values: FloatArray) -> float:
     """Return the standard deviation of Gaussian values with outliers; NaN without any value."""
-    return _GAUSSIAN * finite_median(np.abs(values))
+    return SIGMA_OF_MAD * finite_median(np.abs(values))
 
 
 def _level_share(rows: Readings) -> float:

@@ -16,12 +16,12 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.io.errors import InputError, check_positive
 from arrays.typing import FloatArray
+from magloc.levels import SIGMA_OF_MAD
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.rows import Row, rows_of
 
 _LOG = logging.getLogger(__name__)
 _OUTLIER = 5.0
-_MAD_TO_SIGMA = 1.4826
 _TOO_NOISY = 3.0
 _MORE_NOISE = 1.2  # times the stated one
 _MAD_EFFICIENCY = 0.37  # of a standard deviation by the median absolute deviation, beside the rms
@@ -63,7 +63,7 @@ class RestBackground:
         known = np.isfinite(values)
         with np.errstate(invalid="ignore", divide="ignore"):
             middle = _column_medians(values)
-            seen = _MAD_TO_SIGMA * np.nan_to_num(_column_medians(np.abs(values - middle)))
+            seen = SIGMA_OF_MAD * np.nan_to_num(_column_medians(np.abs(values - middle)))
             scatter = np.maximum(stated, seen)
             used = known & (np.abs(values - middle) <= _OUTLIER * scatter)
             count = used.sum(axis=0)

@@ -17,6 +17,7 @@ from arrays.sensor import Sensor
 from arrays.typing import BoolArray, FloatArray
 from magloc.calibration.modulus import EllipsoidCalibration, calibrate_in_modulus, ellipsoid_calibration
 from magloc.directions import sphere_directions
+from magloc.levels import SIGMA_OF_MAD
 from magloc.live.rows import RowParser, rows_of_stream
 from magloc.live.tally import Clock, Tally
 from magloc.live.transports import STANDARD_INPUT, open_stream, sender_waits
@@ -30,7 +31,6 @@ _FEWEST, _MOST = 12, 2000  # rows in use
 _FIT_S, _GROWTH = 1.0, 1.05  # time of the stream, and growth of the rows in use, between two fits
 _GOAL = 1e-3  # standard deviation of the offsets, over the modulus
 _OUTLYING = 6.0  # residual beyond which a row is disturbed, in standard deviations of the other rows
-_SIGMA_OF_MAD = 1.4826
 _ROUNDS = 3  # of the fit and the search for disturbed rows
 _RECENT, _DISTURBED = 40, 0.25  # last rows in use, and the share of disturbed ones that tells of a magnet nearby
 _SPOILT = 0.02  # residual of the modulus, over it, of a field that is not uniform
@@ -240,7 +240,7 @@ class TurningCalibrator:
             if not fit.converged:
                 return fit, np.zeros(len(rows), dtype=bool)
             residual_T = np.abs(_residual_T(rows, sensor, fit, modulus_T))
-            spread_T = max(_SIGMA_OF_MAD * float(np.nanmedian(residual_T[~disturbed])), sensor.noise_T)
+            spread_T = max(SIGMA_OF_MAD * float(np.nanmedian(residual_T[~disturbed])), sensor.noise_T)
             again = residual_T > _OUTLYING * spread_T
             if np.array_equal(again, disturbed):
                 break

@@ -13,6 +13,7 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.points import field_at_points
 from magloc.grids.work import Arrays, Each, Work
+from magloc.levels import SIGMA_OF_MAD
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag, SmoothTrack, Trial, estimate_lag, fit_at_lag
@@ -78,7 +79,7 @@ class TiledSurvey:
         sample = record_of(array, readings[:: -(-len(readings) // _SAMPLE)], ground.terrain)[0]
         bounds = ground.bounds(sample)
         offset = np.median(sample.values_T, axis=0)
-        spread = 1.4826 * float(np.median(np.abs(sample.values_T - offset)))
+        spread = SIGMA_OF_MAD * float(np.median(np.abs(sample.values_T - offset)))
         reach = sample.height_m - float(bounds.low_m[2])
         assert readings.array_position_m is not None
         tiles, margin_m = tiles_of(readings.array_position_m[:, :2], reach)

@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from arrays.typing import ByteArray, FloatArray, IntArray
+from magloc.levels import SIGMA_OF_MAD
 
 WordArray = NDArray[np.uint16]
 WHITE = 255
 THRESHOLD_SIGMAS = 6.0
-SIGMA_OF_MAD = 1.4826
 FEWEST_PIXELS = 4
 """Least number of pixels of a star; fewer are a hot pixel or noise."""
 FEWEST_SUMS = 10
