@@ -35,8 +35,7 @@ from magloc.localization.locator import Locator
 
 WINDOW_S = 8.0
 """Time before and after a switch; over a longer time the ambient field is no parabola."""
-_DEGREE = 2
-_LEAST_ROWS = 6
+_DEGREE, _LEAST_ROWS = 2, 6
 _AMBIENT_T = 30e-6
 _PRIOR_T = 100e-6  # prior standard deviation of a component of V and o
 _UNKNOWN = 0.5

@@ -116,11 +116,16 @@ class TurningProgress:
     enough: bool
 
     @property
+    def least_covered(self) -> SensorTurning:
+        """Sensor with the smallest coverage."""
+        return min(self.sensors, key=lambda sensor: sensor.coverage)
+
+    @property
     def advice(self) -> str:
         """Sentence on what to do next."""
         if self.enough:
             return "enough: all directions are covered, and the goal is reached"
-        least = min(self.sensors, key=lambda sensor: sensor.coverage)
+        least = self.least_covered
         if least.coverage < _COVERED:
             return f"turn until the field points along {least.turn} of sensor {least.id}"
         return "go on turning slowly in all directions"
@@ -147,9 +152,8 @@ class TurningCalibrator:
     def __init__(self, array: SensorArray, modulus_T: float | None = None, goal_T: float | None = None) -> None:
         if array.channel_is_scalar.all():
             raise ValueError("Input array must have a vector sensor; instead received scalar sensors only.")
-        for name, value in (("modulus_T", modulus_T), ("goal_T", goal_T)):
-            if value is not None:
-                check_positive(**{name: value})
+        stated = {"modulus_T": modulus_T, "goal_T": goal_T}
+        check_positive(**{name: value for name, value in stated.items() if value is not None})
         self.nominal, self._stated_T, self._goal_T = array, modulus_T, goal_T
         self._sensors = [(i, s) for i, s in enumerate(array.sensors) if s.kind == "vector"]
         self.restart()
@@ -304,7 +308,7 @@ def refuse_unfinished(progress: TurningProgress | None, source: str) -> None:
             f"{source}: found fewer than {_FEWEST} directions of the field, expected sensors that are turned."
         )
     if not progress.enough:
-        covered = min(sensor.coverage for sensor in progress.sensors)
+        covered = progress.least_covered.coverage
         why = "; ".join(progress.flags) or f"{100 * covered:.0f} % of the directions are covered; {progress.advice}"
         raise InputError(f"{source}: the rows ended before the calibration was enough: {why}.")
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import webbrowser
 from html import escape
-from threading import Event, Lock, Thread
+from threading import Lock
 
 import numpy as np
 import viser
 
-from magloc.live.turning import SPREAD, SensorTurning, TurningCalibrator, TurningProgress, covered_directions
+from magloc.live.turning import SPREAD, TurningCalibrator, TurningProgress, covered_directions
 from magloc.readings import Readings
 from magloc.viewer.pages import texts
 from magloc.viewer.pages.pages import Page
+from magloc.viewer.panels.drawing_thread import DrawingThread
 from magloc.viewer.scene.framing import aim_camera, corners_of, extent_of, set_up_scene
 from magloc.viewer.scene.glyphs import add_label, add_lines, add_points, show_segments
 from magloc.viewer.scene.legend import Swatch, legend_html
@@ -54,7 +55,7 @@ class _Sphere:
 
     def __init__(self, server: viser.ViserServer, calibrator: TurningCalibrator) -> None:
         self._server, self._calibrator = server, calibrator
-        self._lock, self._new, self._stop = Lock(), Event(), Event()
+        self._lock = Lock()
         self._newest: tuple[Readings, TurningProgress | None] | None = None
         self._drawn: TurningProgress | None = None
         scene = server.scene
@@ -76,51 +77,33 @@ class _Sphere:
         )
         with gui.add_folder("Legend"):
             gui.add_html(legend_html(entries, ()))
-        self.page = Page("calibrate", entries, (), self.close)
-        self._thread = Thread(target=self._run, name="magloc-turning-page", daemon=True)
-        self._thread.start()
+        self._thread = DrawingThread(self._draw, _FRAMES_PER_SECOND)
+        self.page = Page("calibrate", entries, (), self._thread.close)
 
     def update(self, rows: Readings) -> None:
         with self._lock:
             self._newest = rows, self._calibrator.progress
-        self._new.set()
+        self._thread.wake()
 
-    def close(self) -> None:
-        """End the thread. Call this before the server is stopped."""
-        self._stop.set()
-        self._new.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while True:
-            self._new.wait()
-            if self._stop.is_set():
-                return
-            self._new.clear()
-            with self._lock:
-                newest = self._newest
-            if newest is not None:
-                with self._server.atomic():
-                    self._show(*newest)
-            self._stop.wait(1.0 / _FRAMES_PER_SECOND)
+    def _draw(self, is_new: bool) -> None:
+        with self._lock:
+            newest = self._newest
+        if newest is not None:
+            with self._server.atomic():
+                self._show(*newest)
 
     def _show(self, rows: Readings, progress: TurningProgress | None) -> None:
         directions = self._calibrator.newest_directions(rows.values_T[-1])
-        shown = next(iter(directions)) if progress is None else least_covered(progress).id
+        shown = next(iter(directions)) if progress is None else progress.least_covered.id
         show_segments(self._now, np.stack([np.zeros(3), directions[shown]])[None])
         if progress is None or progress is self._drawn:
             return
-        self._drawn, sensor = progress, least_covered(progress)
+        self._drawn, sensor = progress, progress.least_covered
         is_covered = covered_directions(sensor.directions)[:, None]
         self._directions.colors = np.where(is_covered, _COVERED, _MISSING).astype(np.uint8)
         segments = np.zeros((0, 2, 3)) if progress.enough else np.stack([np.zeros(3), sensor.missing])[None]
         show_segments(self._next, segments)
         self._panel.content = texts.panel_html(_lines(progress), warning=bool(progress.flags))
-
-
-def least_covered(progress: TurningProgress) -> SensorTurning:
-    """Return the sensor with the smallest coverage."""
-    return min(progress.sensors, key=lambda sensor: sensor.coverage)
 
 
 def _lines(progress: TurningProgress) -> list[str]:

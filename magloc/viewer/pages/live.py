@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from threading import Event, Lock, Thread
+from threading import Lock
 from time import perf_counter
 from typing import Protocol
 
@@ -24,6 +24,7 @@ from magloc.tracking.results import SourcesPoint, TrackPoint, track_column
 from magloc.tracking.rows import Row
 from magloc.viewer.pages import texts
 from magloc.viewer.pages.track_player import SOURCE_COLOURS, point_html
+from magloc.viewer.panels.drawing_thread import DrawingThread
 from magloc.viewer.panels.readings_plot import ReadingsPlot, residuals_of
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
@@ -105,7 +106,8 @@ class LivePage:
 
     def __init__(self, server: viser.ViserServer, array: SensorArray, controls: Controls | None) -> None:
         self._server, self._array, self._controls = server, array, controls
-        self._lock, self._new, self._stop = Lock(), Event(), Event()
+        self._lock = Lock()
+        self._is_plotted, self._plot_time_s = True, 0.0
         self._newest: LiveRow | None = None
         self._tally: Tally | None = None
         self._latency_s = math.nan
@@ -114,8 +116,7 @@ class LivePage:
         self._glyphs = ArrayGlyphs(server.scene, array)
         self._sources = {SINGLE_ID: LiveSource(server.scene, "/live", array, TRACK_COLOUR, REGION_COLOUR)}
         self._add_panels()
-        self._thread = Thread(target=self._run, name="magloc-live-page", daemon=True)
-        self._thread.start()
+        self._thread = DrawingThread(self._draw, _FRAMES_PER_SECOND)
 
     def entries(self) -> list[Entry]:
         """Return the entries of the legend."""
@@ -136,13 +137,11 @@ class LivePage:
                 window.clear()
             if not window or point.time_s - window[-1].point.time_s >= WINDOW_S / _MOST_ROWS:
                 window.append(newest)
-        self._new.set()
+        self._thread.wake()
 
     def close(self) -> None:
         """End the thread. Call this before the server is stopped."""
-        self._stop.set()
-        self._new.set()
-        self._thread.join()
+        self._thread.close()
 
     def _add_panels(self) -> None:
         gui = self._server.gui
@@ -178,25 +177,20 @@ class LivePage:
         except InputError as error:
             self._message.content = texts.panel_html([escape(str(error))], warning=True)
 
-    def _run(self) -> None:
-        is_plotted, plot_time_s = True, 0.0
-        while True:
-            is_new = self._new.wait(None if is_plotted else _PLOT_S)
-            if self._stop.is_set():
-                return
-            self._new.clear()
-            with self._lock:
-                newest, window = self._newest, list(self._window)
-            if newest is None:
-                continue
-            if is_new:
-                with self._server.atomic():
-                    self._show(newest, window)
-                is_plotted = False
-            if perf_counter() - plot_time_s >= _PLOT_S:
-                self._show_plot(window)
-                is_plotted, plot_time_s = True, perf_counter()
-            self._stop.wait(1.0 / _FRAMES_PER_SECOND)
+    def _draw(self, is_new: bool) -> float | None:
+        """Draw the newest row and, less often, the plots; return the time until a plot that is left [s]."""
+        with self._lock:
+            newest, window = self._newest, list(self._window)
+        if newest is None:
+            return None
+        if is_new:
+            with self._server.atomic():
+                self._show(newest, window)
+            self._is_plotted = False
+        if perf_counter() - self._plot_time_s >= _PLOT_S:
+            self._show_plot(window)
+            self._is_plotted, self._plot_time_s = True, perf_counter()
+        return None if self._is_plotted else _PLOT_S
 
     def _show(self, newest: LiveRow, window: Sequence[LiveRow]) -> None:
         """Show the newest row in the scene and in the panels."""
