@@ -42,6 +42,7 @@ _LARGEST_UNCERTAINTY = 0.02
 _LARGEST_RISE_RATIO = 2.0
 # Noise over the least radius of curvature beyond which the second-order bias of the distance is not valid.
 _LARGEST_NOISE = 0.2
+_NEARLY_ALL, _OUTLYING = 0.9, 3.0  # share of the readings, and factor beyond them at which others are wild
 # Noise spreads the readings by σ/M, which looks like information about directions that they do not cover.
 _FEIGNED = 4.0
 
@@ -194,6 +195,12 @@ def calibrate_in_modulus(
             calibration = Calibration.of("vector", result.scale @ left @ right, result.offset_T)
             sensors[i] = replace(sensor, calibration=calibration)
     return replace(array, sensors=tuple(sensors)), results
+
+
+def wild_limit_T(readings_T: FloatArray) -> float:
+    """Return the size beyond which readings are far larger than nearly all others [T]; infinity without readings."""
+    size = np.abs(readings_T[np.isfinite(readings_T)])
+    return _OUTLYING * float(np.quantile(size, _NEARLY_ALL, method="lower")) if size.size else np.inf
 
 
 def _check_inputs(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> tuple[FloatArray, FloatArray]:

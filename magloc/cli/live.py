@@ -139,7 +139,7 @@ def live(
         from magloc.cli.calibration.live_turning import calibrate_live
 
         with naming_place(), naming(str(array), readings=source, time_s=source):
-            calibrate_live(used, source, replay_speed, turning, known.where, page)
+            calibrate_live(used, array, source, replay_speed, turning, known.where, page)
         return
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)

@@ -15,7 +15,7 @@ from arrays.array import SensorArray
 from arrays.io.errors import InputError, check_positive
 from arrays.sensor import Sensor
 from arrays.typing import BoolArray, FloatArray
-from magloc.calibration.modulus import EllipsoidCalibration, calibrate_in_modulus, ellipsoid_calibration
+from magloc.calibration.modulus import EllipsoidCalibration, calibrate_in_modulus, ellipsoid_calibration, wild_limit_T
 from magloc.directions import sphere_directions
 from magloc.levels import SIGMA_OF_MAD
 from magloc.live.rows import RowParser, rows_of_stream
@@ -75,9 +75,9 @@ class SensorTurning:
         """Largest standard deviation of the scale matrix; NaN without a fit."""
         return self.inflation * math.sqrt(float(np.max(np.diagonal(self.fit.covariance)[3:])))
 
-    def flagged(self, noise_T: float, modulus_T: float) -> bool:
-        """Return whether there is no fit, or the field is not uniform."""
-        return not self.fit.converged or self.inflation * noise_T > _SPOILT * modulus_T
+    def is_uniform(self, noise_T: float, modulus_T: float) -> bool:
+        """Return True if there is a fit, and its residuals are those of a uniform field."""
+        return self.fit.converged and self.inflation * noise_T <= _SPOILT * modulus_T
 
     @property
     def turn(self) -> str:
@@ -125,6 +125,8 @@ class TurningProgress:
         """Sentence on what to do next."""
         if self.enough:
             return "enough: all directions are covered, and the goal is reached"
+        if self.flags:
+            return self.flags[0]
         least = self.least_covered
         if least.coverage < _COVERED:
             return f"turn until the field points along {least.turn} of sensor {least.id}"
@@ -190,15 +192,21 @@ class TurningCalibrator:
         return fitted
 
     def fit(self) -> TurningProgress | None:
-        """Fit all rows so far; None if they are too few."""
+        """Fit all rows so far, unless there are no new ones; None if they are too few."""
+        if self._fitted is self._rows:
+            return self.progress
         if len(self._rows) < _FEWEST:
             return None
         self._fitted, self._fitted_s = self._rows, float(self._times[-1])
         modulus_T = self._modulus_T()
         sensors = tuple(self._sensor_progress(i, sensor, modulus_T) for i, sensor in self._sensors)
         goal_T = self._goal_T or _GOAL * modulus_T
-        noises_T = [sensor.noise_T for _, sensor in self._sensors]
-        flags = [flag for s, noise_T in zip(sensors, noises_T, strict=True) for flag in _flags(s, noise_T, modulus_T)]
+        is_covered = any(sensor.coverage >= _COVERED for sensor in sensors)
+        flags = [
+            flag
+            for (_, sensor), turning in zip(self._sensors, sensors, strict=True)
+            for flag in _flags(turning, sensor.noise_T, modulus_T, is_covered=is_covered)
+        ]
         enough = not flags and all(s.coverage >= _COVERED and s.offset_sigma_T <= goal_T for s in sensors)
         self.progress = TurningProgress(
             self._fitted_s, len(self._rows), sensors, modulus_T, goal_T, tuple(flags), enough
@@ -232,11 +240,12 @@ class TurningCalibrator:
     def _robust_fit(self, rows: FloatArray, sensor: Sensor, modulus_T: float) -> tuple[EllipsoidCalibration, BoolArray]:
         """Return the fit of the rows that agree, and those that do not.
 
-        Rows that contradict the fit before are left out first: a magnet that comes near would bend a fit of all rows.
+        Wild readings and rows that contradict the fit before are left out first: a magnet that comes near would bend a
+        fit of all rows.
         """
-        disturbed = np.zeros(len(rows), dtype=bool)
+        disturbed = _is_wild(rows)
         before = next((s for s in self.progress.sensors if s.id == sensor.id), None) if self.progress else None
-        if before is not None and not before.flagged(sensor.noise_T, modulus_T):
+        if before is not None and before.is_uniform(sensor.noise_T, modulus_T):
             disturbed = np.abs(_residual_T(rows, sensor, before.fit, modulus_T)) > _SPOILT * modulus_T
             disturbed &= disturbed.mean() < 0.5
         for _ in range(_ROUNDS):
@@ -261,7 +270,7 @@ class TurningCalibrator:
             rows = self._rows[:, self.nominal.sensor_channels[i]]
             fields = _fields(rows, sensor, None)
             start_T = start_T or float(np.nanmedian(np.linalg.norm(fields - np.nanmedian(fields, axis=0), axis=1)))
-            fit = ellipsoid_calibration(rows, start_T, sensor.noise_T)
+            fit = ellipsoid_calibration(rows[~_is_wild(rows)], start_T, sensor.noise_T)
             if fit.converged:
                 nominal = float(np.linalg.det(np.asarray(sensor.calibration.scale)))
                 ratios.append(float(np.cbrt(np.linalg.det(fit.scale) / abs(nominal))))
@@ -313,19 +322,25 @@ def refuse_unfinished(progress: TurningProgress | None, source: str) -> None:
         raise InputError(f"{source}: the rows ended before the calibration was enough: {why}.")
 
 
+def _is_wild(rows: FloatArray) -> BoolArray:
+    """Return which rows (n,) have a reading far larger than nearly all others."""
+    return np.asarray((np.abs(rows) > wild_limit_T(rows)).any(axis=1))
+
+
 def _residual_T(rows: FloatArray, sensor: Sensor, fit: EllipsoidCalibration, modulus_T: float) -> FloatArray:
     """Return the moduli (n,) of the calibrated readings less that of the field."""
     moduli_T: FloatArray = np.linalg.norm(_fields(rows, sensor, fit), axis=1)
     return moduli_T - modulus_T
 
 
-def _flags(sensor: SensorTurning, noise_T: float, modulus_T: float) -> list[str]:
-    """Return sentences about a field that is not uniform."""
+def _flags(sensor: SensorTurning, noise_T: float, modulus_T: float, *, is_covered: bool) -> list[str]:
+    """Return sentences about a field that is not uniform, or a sensor without a fit although others are turned."""
     if not sensor.fit.converged:
-        return []
+        why = f"sensor {sensor.id} cannot be calibrated, although the directions are covered: {sensor.fit.reason}"
+        return [f"{why}; check its wiring, its unit and its noise_nT"] if is_covered else []
     if sensor.disturbed[-_RECENT:].mean() > _DISTURBED:
         return [f"sensor {sensor.id}: a magnet or iron is near, because the modulus changes; go away from it"]
-    if sensor.flagged(noise_T, modulus_T):
+    if not sensor.is_uniform(noise_T, modulus_T):
         return [f"sensor {sensor.id}: the modulus is not that of a uniform field; go away from iron and start again"]
     return []
 

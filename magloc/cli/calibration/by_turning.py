@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from arrays.array import SensorArray
 from arrays.io.csv import read_table
 from arrays.io.errors import InputError
 from arrays.io.tables import by_sigma
 from arrays.typing import FloatArray
-from magloc.calibration.modulus import EllipsoidCalibration
+from magloc.calibration.modulus import EllipsoidCalibration, wild_limit_T
 from magloc.calibration.results import TurningCalibration
 from magloc.readings import Readings
 
 # Largest factor between a gain and that of the array file: beyond it the modulus has another unit.
 _LARGEST_CHANGE = 3.0
-_NEARLY_ALL, _OUTLYING = 0.9, 3.0  # share of the readings, and factor beyond them at which others are outliers
 
 
 def modulus_of(given: str, readings: Readings) -> float | FloatArray:
@@ -72,12 +72,17 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
         if not fit.converged:
             fault = f"sensor {name} cannot be calibrated: {fit.reason}{overflow(result.readings_T)}"
             raise InputError(f"{readings}: {fault}; {out} is not written.")
-    for before, sensor in zip(result.nominal.sensors, result.array.sensors, strict=True):
+    check_gains(result.nominal, result.array, float(np.median(result.modulus_T)), array, out)
+
+
+def check_gains(nominal: SensorArray, calibrated: SensorArray, modulus_T: float, array: Path, out: Path) -> None:
+    """Refuse gains far from those of the array file."""
+    for before, sensor in zip(nominal.sensors, calibrated.sensors, strict=True):
         volumes = np.linalg.det([sensor.calibration.scale, before.calibration.scale])
         ratio = float(np.cbrt(volumes[0] / volumes[1]))
         if not 1.0 / _LARGEST_CHANGE < ratio < _LARGEST_CHANGE:
             raise InputError(
-                f"--modulus-nT: found {1e9 * float(np.median(result.modulus_T)):g}, which makes the gains of sensor"
+                f"--modulus-nT: found {1e9 * modulus_T:g}, which makes the gains of sensor"
                 f" {sensor.id} {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with"
                 f" its gains; {out} is not written."
             )
@@ -85,8 +90,7 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
 
 def overflow(readings_T: FloatArray) -> str:
     """Return a sentence on readings far larger than nearly all others; empty if there are none."""
-    size = np.abs(readings_T[np.isfinite(readings_T)])
-    most = _OUTLYING * float(np.quantile(size, _NEARLY_ALL, method="lower")) if size.size else np.inf
+    size, most = np.abs(readings_T[np.isfinite(readings_T)]), wild_limit_T(readings_T)
     n = int((size > most).sum())
     if not n:
         return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 import arrays
 from arrays.array import SensorArray
 from magloc.ambient import Place, modulus_at
+from magloc.cli.calibration.by_turning import check_gains
 from magloc.cli.framework import note, print_json
 from magloc.cli.live import PageOptions, TurningOptions
 from magloc.live.tally import Tally
@@ -19,6 +21,7 @@ from magloc.live.turning import TurningCalibrator, TurningProgress, refuse_unfin
 
 def calibrate_live(
     array: SensorArray,
+    path: Path,
     source: str,
     replay_speed: float,
     options: TurningOptions,
@@ -50,7 +53,10 @@ def calibrate_live(
                     break
         refuse_unfinished(progress, source)
         assert options.out_array is not None
-        arrays.write_array(options.out_array, calibrator.array())
+        assert calibrator.progress is not None
+        calibrated = calibrator.array()
+        check_gains(array, calibrated, calibrator.progress.modulus_T, path, options.out_array)
+        arrays.write_array(options.out_array, calibrated)
         if modulus_T is None:
             note("the modulus of the field is not known: the mean gain of the sensors stays as in the array file")
         note(f"enough: wrote {options.out_array}")

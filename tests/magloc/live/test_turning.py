@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -94,6 +95,28 @@ class TestProgress:
         for true, found in zip(TRUE, calibrator.array().sensors, strict=True):
             np.testing.assert_allclose(found.calibration.offset_T, true.offset_T, atol=5.0 * after.goal_T)
 
+    @pytest.mark.parametrize("broken", ["dead", "stuck", "dead axis"])
+    def test_a_broken_sensor_is_named(self, broken):
+        """The other one is calibrated; without a name the user would turn for ever."""
+        values = turned().values_T
+        if broken == "dead axis":
+            values[:, 4] = 0.0
+        else:
+            values[:, 3:] = np.nan if broken == "dead" else 1e-6
+        progress = TurningCalibrator(board(), FIELD_T).add(replace(turned(), values_T=values))
+        assert progress.advice.startswith("sensor s1 cannot be calibrated, although the directions are covered: ")
+        assert progress.sensors[0].fit.converged
+        assert not progress.enough
+
+    def test_wild_readings_are_left_out(self):
+        values = turned().values_T
+        values[::37, 0] = 1e-2
+        calibrator = TurningCalibrator(board(), FIELD_T)
+        progress = calibrator.add(replace(turned(), values_T=values))
+        assert progress.enough
+        assert progress.sensors[0].disturbed.sum() > 5
+        np.testing.assert_allclose(calibrator.array().sensors[0].calibration.offset_T, TRUE[0].offset_T, atol=20e-9)
+
     @pytest.mark.parametrize(
         ("change", "said"), [({"modulus_T": 0.0}, "modulus_T"), ({"goal_T": -1.0}, "goal_T"), ({}, "vector sensor")]
     )
@@ -134,6 +157,7 @@ class TestCommand:
             ("flat.csv", [], "the rows ended before the calibration was enough: "),
             ("turned.csv", ["--rest-s", "3"], "--rest-s: found together with --calibrate, expected one of them"),
             ("turned.csv", ["--goal-nT", "0"], "goal"),
+            ("turned.csv", ["--modulus-nT", "480000"], "found 480000, which makes the gains of sensor s0 0.1"),
         ],
     )
     def test_refusals(self, files, capsys, log, more, said):
