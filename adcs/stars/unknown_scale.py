@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from itertools import chain, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,12 +145,10 @@ def identify_at_unknown_scale(
         cameras, prior = [lens.camera], lens.prior
     else:
         cameras, prior = _cameras(width_px, height_px, rad_per_px, tolerance)
-    tracked = last is not None and lens is None and near.share >= 1.0
-    for fix, matcher in chain(
-        _near_last(catalogue, width_px, height_px, points, magnitudes, noise_px, last if tracked else None),
-        _of_cameras(catalogue, cameras, points, magnitudes, prior, noise_px, near),
-    ):
-        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(cameras) + tracked):
+    used = None if lens is not None or near.share < 1.0 else last
+    for matcher, lens_prior, mirrored in _matchers(catalogue, cameras, prior, noise_px, near, used):
+        fix = matcher.identify(points, magnitudes, lens_prior, mirrored=mirrored)
+        if isinstance(fix, StarFix) and fix.log10_chance < -6.0 - math.log10(2 * len(cameras) + (used is not None)):
             if lens is None and matcher.camera.diagonal_rad > _STRONG_RAD:
                 fix = matcher.refine_lens(points, magnitudes, fix)
             return replace(fix, stars=np.stack([brightest[fix.stars[:, 0]], fix.stars[:, 1]], axis=1))
@@ -158,34 +156,23 @@ def identify_at_unknown_scale(
     return NoFix(f"{where}no scale of {len(cameras)} explains the {len(points)} brightest lights, mirrored or not")
 
 
-def _near_last(
-    catalogue: StarCatalogue,
-    width_px: int,
-    height_px: int,
-    points: FloatArray,
-    magnitudes: FloatArray,
-    noise_px: float,
-    last: StarFix | None,
-) -> Iterator[tuple[StarFix | NoFix, StarMatcher]]:
-    """Identify a picture with the lens of the picture before, near its centre."""
-    if last is None or (last.pose.camera.width_px, last.pose.camera.height_px) != (width_px, height_px):
-        return
-    camera = last.pose.camera
-    around = SkyCap(-last.R_catalogue_from_frame[:, 2], camera.diagonal_rad)
-    matcher = StarMatcher.of(catalogue, camera, noise_px, around)
-    yield matcher.identify(points, magnitudes, _SAME_LENS, mirrored=last.mirrored), matcher
-
-
-def _of_cameras(
+def _matchers(
     catalogue: StarCatalogue,
     cameras: list[StarCamera],
-    points: FloatArray,
-    magnitudes: FloatArray,
     prior: LensPrior,
     noise_px: float,
     near: SkyCap,
-) -> Iterator[tuple[StarFix | NoFix, StarMatcher]]:
-    """Identify a picture with each camera, then mirrored."""
+    last: StarFix | None,
+) -> Iterator[tuple[StarMatcher, LensPrior, bool]]:
+    """Yield the matchers to try, with the prior of their lens, and whether the picture is mirrored.
+
+    The matcher of the picture before comes first, for the sky around its centre, if the pictures have the same size.
+    """
+    if last is not None:
+        camera = last.pose.camera
+        if (camera.width_px, camera.height_px) == (cameras[0].width_px, cameras[0].height_px):
+            around = SkyCap(-last.R_catalogue_from_frame[:, 2], camera.diagonal_rad)
+            yield StarMatcher.of(catalogue, camera, noise_px, around), _SAME_LENS, last.mirrored
     ranked = ranked_triangles(catalogue)
 
     @cache
@@ -193,7 +180,7 @@ def _of_cameras(
         return StarMatcher.of(catalogue, camera, noise_px, near, ranked)
 
     for mirrored, camera in product((False, True), cameras):
-        yield matcher_of(camera).identify(points, magnitudes, prior, mirrored=mirrored), matcher_of(camera)
+        yield matcher_of(camera), prior, mirrored
 
 
 def _cameras(
