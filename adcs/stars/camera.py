@@ -132,6 +132,10 @@ class StarCamera:
         """Return the places s (f, 2) of points (f, 2) of the image."""
         return (points_px - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
 
+    def exchange_sides(self, points_px: FloatArray) -> FloatArray:
+        """Return the points (f, 2) of the image with left and right exchanged."""
+        return points_px * [-1.0, 1.0] + [float(self.width_px), 0.0]
+
     def corrected(self, places: FloatArray) -> FloatArray:
         """Return the places q (f, 2) without distortion of places s (f, 2) of the image."""
         return places + distortion_terms(places) @ self.distortion

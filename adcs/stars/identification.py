@@ -187,7 +187,7 @@ class StarMatcher:
             return self._unsolved(f"{min(len(order), len(self.rows))} stars, 4 needed")
         points = np.asarray(points_px, dtype=np.float64)[order]
         if mirrored:
-            points = points * [-1.0, 1.0] + [self.camera.width_px, 0.0]
+            points = self.camera.exchange_sides(points)
             tangents = tangents * [-1.0, 1.0]
         checks = self._checks(min(len(order), _CHECKED), prior)
         image = star_triangles(self.camera.directions(points[:_IMAGE_STARS]), 2.0, _IMAGE_BRIGHTER)
@@ -235,7 +235,7 @@ class StarMatcher:
         ``points_px`` (f, 2), ``magnitudes`` (f,): stars of the fix, brightest first. The gate narrows in steps, because
         the first fit may miss the stars in the corners.
         """
-        points = points_px * [-1.0, 1.0] + [self.camera.width_px, 0.0] if fix.mirrored else points_px
+        points = self.camera.exchange_sides(points_px) if fix.mirrored else points_px
         best = fix
         for projection in get_args(Projection):
             start = replace(fix.pose, camera=as_projection(fix.pose.camera, projection))

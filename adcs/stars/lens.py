@@ -64,7 +64,7 @@ def calibrate_lens(fix: StarFix, points_px: FloatArray, catalogue: StarCatalogue
     """
     points = points_px[fix.stars[:, 0]]
     if fix.mirrored:
-        points = points * [-1.0, 1.0] + [fix.pose.camera.width_px, 0.0]
+        points = fix.pose.camera.exchange_sides(points)
     pose = fix.pose
     for _ in range(_STEPS):
         pose = fit_pose(points, catalogue.directions[fix.stars[:, 1]], pose, fix.pose.camera, _CALIBRATION, noise_px)
