@@ -16,7 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
-from adcs.complementary.inertial_magnetic import LONGEST_LAG_S, InertialMagneticRecord, magnetometer_lag
+from adcs.complementary.inertial_magnetic import (
+    LONGEST_LAG_S,
+    InertialMagneticRecord,
+    RecordMotion,
+    magnetometer_lag,
+)
 from adcs.complementary.names import MAGNETS, Magnet
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.values import numbers
@@ -110,7 +115,8 @@ class AttitudeConfig:
         """
         times, rate, acceleration, field_ = map(numbers, (time_s, gyro_rad_s, acceleration_m_s2, field_T))
         record = InertialMagneticRecord(times, rate, acceleration, field_, gyro_samples)
-        return cls(magnet, gyro_samples, magnetometer_lag(record), model or HeadingModel())
+        model = model or HeadingModel()
+        return cls(magnet, gyro_samples, magnetometer_lag(record, RecordMotion.of(record, model)), model)
 
 
 @dataclass(frozen=True, eq=False)
