@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 import adcs
 from adcs import quaternion
 from adcs.complementary.attitude_filter import FLAGS, AttitudeFilter
-from adcs.complementary.heading import HeadingModel
+from adcs.complementary.heading import HeadingModel, heading_track, rotate_to_north
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare
 from adcs.complementary.names import MAGNETS
 from adcs.complementary.orientation_errors import orientation_errors
 from adcs.io.imu_files import read_imu
@@ -107,6 +108,50 @@ class TestBatch:
         for time_s, *readings in zip(*log[:4], strict=True):
             none = (None if np.isnan(values).any() else values for values in readings)
             np.testing.assert_array_equal(one.update(time_s, *readings).q, other.update(time_s, *none).q)
+
+
+class TestReference:
+    @pytest.mark.parametrize("seed", [30, 31])
+    @pytest.mark.parametrize("kind", ["plain", "magnet", "room", "gaps"])
+    def test_the_filter_in_numpy(self, kind: str, seed: int) -> None:
+        """From 2 s on the attitudes agree within a tenth of σ, σ to 2 %, and the same fields are left out.
+
+        The filter in NumPy knows the usual steps from the start, and the filter for one reading learns them.
+        """
+        time_s, rate, acceleration, field_T, q = unit_log(seed, seconds=40.0)
+        late, magnet = time_s > 15.0, np.array([6e-6, -4e-6, 19e-6])
+        if kind == "magnet":
+            field_T[late] += magnet
+        elif kind == "room":
+            field_T[late] += quaternion.rotate_back(q[late], magnet)
+        elif kind == "gaps":
+            field_T[late & (time_s < 25.0)] = np.nan
+            acceleration[(time_s > 28.0) & (time_s < 30.0)] = np.nan
+        ready = prepare(InertialMagneticRecord(time_s, rate, acceleration, field_T))
+        heading = heading_track(
+            time_s,
+            ready.rate_rad_s,
+            ready.q_level,
+            ready.field_T,
+            hidden_rad2=ready.hidden_rad2,
+            start_tilt_rad=ready.start_tilt_rad,
+        )
+        filter_ = AttitudeFilter(adcs.AttitudeConfig(lag_s=ready.lag_s))
+        found = estimates(filter_, (time_s, rate, acceleration, field_T, q))[time_s > 2.0]
+        expected, tilt, of_heading, left_out = (
+            values[time_s > 2.0]
+            for values in (
+                rotate_to_north(ready.q_level, heading.heading_rad),
+                ready.tilt_sigma_rad,
+                heading.sigma_rad,
+                heading.left_out,
+            )
+        )
+        apart = quaternion.angle_between(found[:, :4], expected)
+        assert (apart < 0.1 * np.hypot(tilt, of_heading)).all()
+        np.testing.assert_allclose(found[:, 4:6], np.stack([tilt, of_heading], axis=1), rtol=0.02)
+        np.testing.assert_array_equal(found[:, 15].astype(int) >> FLAGS.index("field-left-out") & 1, left_out)
+        assert left_out.any() == (kind in ("magnet", "room"))
 
 
 class TestState:
