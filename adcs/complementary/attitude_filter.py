@@ -23,6 +23,7 @@ from adcs.complementary.inertial_magnetic import (
     magnetometer_lag,
 )
 from adcs.complementary.names import MAGNETS, Magnet
+from adcs.satellite.telemetry import single_reading
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.values import numbers
 from arrays.typing import BoolArray, FloatArray
@@ -249,12 +250,13 @@ class AttitudeFilter:
         Raises
         ------
         ValueError
-            The time does not ascend, or a reading is infinite, too large or a zero vector. The filter is then as
-            before the call.
+            The time does not ascend, or a reading is infinite, too large, a zero vector or of another shape. The filter
+            is then as before the call.
         """
         self._time[0] = time_s
-        for place, reading in zip(self._readings, (gyro_rad_s, acceleration_m_s2, field_T), strict=True):
-            place[0] = math.nan if reading is None else reading
+        given = {"gyro_rad_s": gyro_rad_s, "acceleration_m_s2": acceleration_m_s2, "field_T": field_T}
+        for place, (name, reading) in zip(self._readings, given.items(), strict=True):
+            place[0] = single_reading(name, reading)
         core.run("attitude_filter", self._work, 1, block=1, workspace=self._state_memory)
         self._work.struct.resume = 1
         rows = self._rows

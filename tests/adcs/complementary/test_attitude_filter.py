@@ -178,6 +178,8 @@ class TestState:
         ):
             with pytest.raises(ValueError, match=words):
                 AttitudeFilter.from_state({**state, **change})
+        with pytest.raises(ValueError, match=r"must be one of AttitudeFilter.state\(\); instead received a list"):
+            AttitudeFilter.from_state([state])  # type: ignore[arg-type]
 
 
 class TestInput:
@@ -190,6 +192,8 @@ class TestInput:
             ({1: [0.0, math.inf, 0.0]}, "gyro_rad_s must be at most 1e4"),
             ({2: [0.0, 0.0, 0.0]}, "acceleration_m_s2 must have a length"),
             ({3: [0.0, 0.0, 50.0]}, "field_T must have a length, at most 1 T"),
+            ({1: [0.0, 0.0]}, r"gyro_rad_s must have shape \(3,\); instead received \(2,\)"),
+            ({2: 9.8}, r"acceleration_m_s2 must have shape \(3,\); instead received \(\)"),
         ],
     )
     def test_bad_input_changes_nothing(self, change: dict[int, object], words: str) -> None:
