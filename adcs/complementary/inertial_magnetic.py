@@ -51,7 +51,7 @@ _LAG_EVERY_S = 0.01  # closer readings are redundant
 LONGEST_LAG_S = 0.04
 """Longest lag of a magnetometer behind the gyro [s]."""
 _USUAL_LENGTH = 0.1  # largest relative difference of the length of an undisturbed field
-_LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # larger readings have another unit
+_LARGEST = {"rate_rad_s": (1e4, "rad/s"), "acceleration_m_s2": (1e6, "m/s²"), "field_T": (1.0, "T")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +91,14 @@ class InertialMagneticRecord:
         for name in ("rate_rad_s", "acceleration_m_s2", "field_T"):
             values = numbers(getattr(self, name))
             if values.shape != shape or np.isinf(values).any():
-                raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
-            if np.nanmax(np.abs(values), initial=0.0) > _LARGEST[name]:
-                raise ValueError(f"Input {name} must not exceed {_LARGEST[name]:g}; instead received more.")
+                found = "an infinite value" if values.shape == shape else f"shape {values.shape}"
+                raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {found}.")
+            largest, unit = _LARGEST[name]
+            if (most := np.nanmax(np.abs(values), initial=0.0)) > largest:
+                raise ValueError(
+                    f"Input {name} must not exceed {largest:g} {unit}; instead received {most:.3g}. "
+                    f"Convert it to {unit}."
+                )
             missing = np.asarray(np.isnan(values).any(axis=1))
             if missing.any():
                 values = np.where(missing[:, None], np.nan, values)
