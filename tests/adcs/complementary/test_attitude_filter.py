@@ -258,6 +258,8 @@ class TestConfig:
     def test_defaults_are_those_of_the_header(self) -> None:
         """In name, order and value: the kernel copies them as they lie."""
         text = (HEADERS / "field_heading.hpp").read_text(encoding="utf-8")
+        of_state = (HEADERS / "attitude_filter.hpp").read_text(encoding="utf-8")
+        assert f"uint32_t version = {AttitudeFilter().state()['version']};" in of_state
         struct = re.search(r"struct HeadingParameters \{(.*?)\};", text, re.DOTALL)
         assert struct is not None
         found = {name: float(value) for name, value in re.findall(r"(\w+) = Real\(([-\d.e]+)\)", struct[1])}
