@@ -20,6 +20,7 @@ from adcs.complementary.inertial_magnetic import (
     LONGEST_LAG_S,
     InertialMagneticRecord,
     RecordMotion,
+    check_units,
     magnetometer_lag,
 )
 from adcs.complementary.names import MAGNETS, Magnet
@@ -112,10 +113,12 @@ class AttitudeConfig:
     ) -> AttitudeConfig:
         """Return settings with the lag of the magnetometer in a log in which the unit rotates.
 
-        Arguments as of :func:`adcs.inertial_magnetic_filter`.
+        Arguments as of :func:`adcs.inertial_magnetic_filter`. Raises ValueError as it does, so also if the unit or the
+        axes of a sensor contradict the others.
         """
         times, rate, acceleration, field_ = map(numbers, (time_s, gyro_rad_s, acceleration_m_s2, field_T))
         record = InertialMagneticRecord(times, rate, acceleration, field_, gyro_samples)
+        check_units(record)
         model = model or HeadingModel()
         return cls(magnet, gyro_samples, magnetometer_lag(record, RecordMotion.of(record, model)), model)
 

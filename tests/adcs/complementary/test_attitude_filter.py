@@ -280,6 +280,11 @@ class TestConfig:
         ]
         assert totals[0] < totals[1]
 
+    def test_a_log_with_wrong_axes(self) -> None:
+        time_s, gyro, acceleration, field_T, _ = unit_log(11, seconds=60.0)
+        with pytest.raises(ValueError, match=r"field_T must turn as the other sensors do.*its axes x and y exchanged"):
+            adcs.AttitudeConfig.from_log(time_s, gyro, acceleration, field_T[:, [1, 0, 2]])
+
     def test_refusals(self) -> None:
         with pytest.raises(ValueError, match=r"lag_s must be within 0 and 0\.04 s; instead received 1\.0"):
             adcs.AttitudeConfig(lag_s=1.0)
