@@ -25,6 +25,8 @@ def read_sealed(state: Mapping[str, Any], version: int, owner: str, read: Callab
     ValueError
         The state has another version, is damaged, or is no state of the owner.
     """
+    if not isinstance(state, Mapping):
+        raise ValueError(f"Input state must be one of {owner}.state(); instead received a {type(state).__name__}.")
     if (found := state.get("version")) != version:
         raise ValueError(f"Input state must have version {version}; instead received {found!r}.")
     try:

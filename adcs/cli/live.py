@@ -13,8 +13,6 @@ from arrays.io.errors import LARGEST
 from magloc.cli.framework import ABOVE_ZERO, QuietOptions, note, print_json, refuse_outside
 from magloc.cli.options import STREAM
 
-_LONGEST_LAG_S = 0.04
-
 
 def live(
     *,
@@ -29,7 +27,8 @@ def live(
 
     Every row gives one JSON line at once, with the columns of adcs imu and its flags. Rows are CSV, after a header with
     the columns of a log of adcs imu, or JSON objects with these names. Lines that are no rows, and rows that come late,
-    are counted and named on stderr. The unit should rest during the first second.
+    twice or with a time that jumps, are counted and named on stderr. After ten rows of a clock that was set back, the
+    filter starts anew. The unit should rest during the first second.
 
     Parameters
     ----------
@@ -47,9 +46,10 @@ def live(
     common : QuietOptions
         Common options.
     """
+    from adcs.complementary.inertial_magnetic import LONGEST_LAG_S
     from adcs.io.imu_streams import ImuStream, entry_of
 
-    refuse_outside(0.0, _LONGEST_LAG_S, "0 to 0.04 s", unit=" s", lag_s=lag_s)
+    refuse_outside(0.0, LONGEST_LAG_S, f"0 to {LONGEST_LAG_S:g} s", unit=" s", lag_s=lag_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
     stream = ImuStream(config, magnet=MAGNETS[method], lag_s=lag_s)
     try:
@@ -57,5 +57,6 @@ def live(
             print_json(entry_of(estimate))
             sys.stdout.flush()
     finally:
-        if stream.tally.rows:
-            note(f"{stream.tally.rows} rows, {stream.tally.late} late, {stream.tally.garbled} garbled")
+        if (tally := stream.tally).rows:
+            rows = f"{tally.rows} rows, {tally.late} late, {tally.garbled} garbled, {tally.doubled} doubled"
+            note(f"{rows}, clock set back {tally.restarts} times")

@@ -16,8 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
-from adcs.complementary.inertial_magnetic import LONGEST_LAG_S, InertialMagneticRecord, magnetometer_lag
+from adcs.complementary.inertial_magnetic import (
+    LONGEST_LAG_S,
+    InertialMagneticRecord,
+    RecordMotion,
+    check_units,
+    magnetometer_lag,
+)
 from adcs.complementary.names import MAGNETS, Magnet
+from adcs.satellite.telemetry import single_reading
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
 from arrays.io.values import numbers
 from arrays.typing import BoolArray, FloatArray
@@ -106,11 +113,14 @@ class AttitudeConfig:
     ) -> AttitudeConfig:
         """Return settings with the lag of the magnetometer in a log in which the unit rotates.
 
-        Arguments as of :func:`adcs.inertial_magnetic_filter`.
+        Arguments as of :func:`adcs.inertial_magnetic_filter`. Raises ValueError as it does, so also if the unit or the
+        axes of a sensor contradict the others.
         """
         times, rate, acceleration, field_ = map(numbers, (time_s, gyro_rad_s, acceleration_m_s2, field_T))
         record = InertialMagneticRecord(times, rate, acceleration, field_, gyro_samples)
-        return cls(magnet, gyro_samples, magnetometer_lag(record), model or HeadingModel())
+        check_units(record)
+        model = model or HeadingModel()
+        return cls(magnet, gyro_samples, magnetometer_lag(record, RecordMotion.of(record, model)), model)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,12 +253,13 @@ class AttitudeFilter:
         Raises
         ------
         ValueError
-            The time does not ascend, or a reading is infinite, too large or a zero vector. The filter is then as
-            before the call.
+            The time does not ascend, or a reading is infinite, too large, a zero vector or of another shape. The filter
+            is then as before the call.
         """
         self._time[0] = time_s
-        for place, reading in zip(self._readings, (gyro_rad_s, acceleration_m_s2, field_T), strict=True):
-            place[0] = math.nan if reading is None else reading
+        given = {"gyro_rad_s": gyro_rad_s, "acceleration_m_s2": acceleration_m_s2, "field_T": field_T}
+        for place, (name, reading) in zip(self._readings, given.items(), strict=True):
+            place[0] = single_reading(name, reading)
         core.run("attitude_filter", self._work, 1, block=1, workspace=self._state_memory)
         self._work.struct.resume = 1
         rows = self._rows

@@ -17,8 +17,8 @@ from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track
 from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, rotate_to_north
 from adcs.complementary.inertial_magnetic import (
     InertialMagneticRecord,
+    RecordMotion,
     check_units,
-    log_warnings,
     magnetometer_lag,
     prepare,
 )
@@ -245,7 +245,8 @@ class _Attitudes(NamedTuple):
 
 def _filtered(record: InertialMagneticRecord, magnet: Magnet, model: HeadingModel) -> _Attitudes:
     """Run the filter for one reading at a time over a record, with the lag of the record."""
-    config = AttitudeConfig(magnet, record.gyro_samples, magnetometer_lag(record), model)
+    motion = RecordMotion.of(record, model)
+    config = AttitudeConfig(magnet, record.gyro_samples, magnetometer_lag(record, motion), model)
     rows = filter_rows(config, record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T)
     if rows.status.any():
         raise ValueError(f"Input time_s must be within 1e14 s; instead received {np.abs(record.time_s).max():g} s.")
@@ -260,7 +261,7 @@ def _filtered(record: InertialMagneticRecord, magnet: Magnet, model: HeadingMode
         left_out,
         subtracted,
         doubted,
-        log_warnings(record, model),
+        motion.warnings,
     )
 
 

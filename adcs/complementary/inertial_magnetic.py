@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
@@ -50,7 +51,7 @@ _LAG_EVERY_S = 0.01  # closer readings are redundant
 LONGEST_LAG_S = 0.04
 """Longest lag of a magnetometer behind the gyro [s]."""
 _USUAL_LENGTH = 0.1  # largest relative difference of the length of an undisturbed field
-_LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # larger readings have another unit
+_LARGEST = {"rate_rad_s": (1e4, "rad/s"), "acceleration_m_s2": (1e6, "m/s²"), "field_T": (1.0, "T")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +91,14 @@ class InertialMagneticRecord:
         for name in ("rate_rad_s", "acceleration_m_s2", "field_T"):
             values = numbers(getattr(self, name))
             if values.shape != shape or np.isinf(values).any():
-                raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
-            if np.nanmax(np.abs(values), initial=0.0) > _LARGEST[name]:
-                raise ValueError(f"Input {name} must not exceed {_LARGEST[name]:g}; instead received more.")
+                found = "an infinite value" if values.shape == shape else f"shape {values.shape}"
+                raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {found}.")
+            largest, unit = _LARGEST[name]
+            if (most := np.nanmax(np.abs(values), initial=0.0)) > largest:
+                raise ValueError(
+                    f"Input {name} must not exceed {largest:g} {unit}; instead received {most:.3g}. "
+                    f"Convert it to {unit}."
+                )
             missing = np.asarray(np.isnan(values).any(axis=1))
             if missing.any():
                 values = np.where(missing[:, None], np.nan, values)
@@ -204,48 +210,84 @@ def _extend_to_start(rate_rad_s: FloatArray) -> FloatArray:
     return np.concatenate([np.repeat(rate_rad_s[first : first + 1], first, axis=0), rate_rad_s[first:]])
 
 
+@dataclass(frozen=True, eq=False)
+class RecordMotion:
+    """Motion that the gyro of a record shows, and gaps of its sensors."""
+
+    time_s: FloatArray  # (n,)
+    bias_rad_s: FloatArray  # (n, 3)
+    bias_sigma_rad_s: float  # σ of the bias of a gyro that never rests
+    start_motion: str  # in words; empty at rest
+    read: dict[str, BoolArray]  # (n,): rows with a reading of each sensor that the record has, the gyro first
+    rate_rad_s: FloatArray  # (n, 3): mean over the step that ends at each instant, without the bias
+    q_gyro: FloatArray  # (n, 4): attitudes of the gyro alone, starting with the identity
+    gaps: NDArray[np.intp]  # (k, 2): rows before and after the gaps of the gyro
+    hidden_rad2: FloatArray  # (n,): growth of the attitude's variance within these gaps, and by rotations seen after
+
+    @classmethod
+    def of(cls, record: InertialMagneticRecord, model: HeadingModel) -> RecordMotion:
+        """Return the motion of a record."""
+        time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
+        moves = start_motion(record, bias[0])
+        read = {"gyro": is_read(record.rate_rad_s), "accelerometer": is_read(record.acceleration_m_s2)}
+        if record.has_field:
+            read["magnetometer"] = is_read(record.field_T)
+        bias_sigma = 0.0
+        if not bias.any():
+            bias_sigma = _UNKNOWN_BIAS_RAD_S if moves else 0.0
+            bias = bias if moves else bias + np.nanmean(record.rate_rad_s[record.in_first_second], axis=0)
+        rate = step_rates(_extend_to_start(record.rate_rad_s) - bias, dt_s, record.gyro_samples)
+        q_gyro = gyro_attitudes(rate, dt_s)
+        gaps = sensor_gaps(time_s, read["gyro"])
+        hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
+        usual_field_T = np.where(_has_usual_length(record)[:, None], record.field_T, np.nan)
+        hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, usual_field_T))
+        return cls(time_s, bias, bias_sigma, moves, read, rate, q_gyro, gaps, hidden)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on a start in motion and on gaps of the sensors."""
+        hides = [np.sum(self.hidden_rad2[before + 1 : after + 1]) > LOST_RAD**2 for before, after in self.gaps]
+        of_gaps = gap_warnings(self.time_s, self.read, self.gaps[np.array(hides, np.bool_)])
+        if not self.start_motion:
+            return tuple(of_gaps)
+        never = ", and it never rests, so that the gyro's bias is unknown" if self.bias_sigma_rad_s else ""
+        start = f"the unit is not at rest in the first second ({self.start_motion}){never}"
+        return f"{start}; the start is estimated with a larger σ", *of_gaps
+
+
 def prepare(
     record: InertialMagneticRecord, model: HeadingModel = HeadingModel(), *, offline: bool = False
 ) -> PreparedReadings:
     """Remove bias, lag and motion from a record; see :class:`PreparedReadings`.
 
-    Each instant uses the readings up to it, offline the whole record. The lag always uses the whole record.
+    Each instant uses the readings up to it, offline the whole record. The lag always uses the whole record. Not offline
+    it is the reference, with :func:`adcs.complementary.heading.heading_track`, for :class:`adcs.AttitudeFilter`.
     """
-    time_s, dt_s, bias = record.time_s, record.dt_s, rest_bias(record)
-    moves = start_motion(record, bias[0])
-    read = _sensors_read(record)
-    bias_sigma = 0.0
-    if not bias.any():
-        bias_sigma = _UNKNOWN_BIAS_RAD_S if moves else 0.0
-        bias = bias if moves else bias + np.nanmean(record.rate_rad_s[record.in_first_second], axis=0)
-    rate = step_rates(_extend_to_start(record.rate_rad_s) - bias, dt_s, record.gyro_samples)
-    q_gyro = gyro_attitudes(rate, dt_s)
-    gaps = sensor_gaps(time_s, read["gyro"])
-    hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
-    usual_field_T = np.where(_has_usual_length(record)[:, None], record.field_T, np.nan)
-    hidden += observed_turn_variance(time_s, gaps, hidden, quaternion.rotate(q_gyro, usual_field_T))
-    at_rest = record.in_first_second & (not moves) & (np.cumsum(hidden) < LOST_RAD**2)
+    motion = RecordMotion.of(record, model)
+    time_s, dt_s, rate, q_gyro = record.time_s, record.dt_s, motion.rate_rad_s, motion.q_gyro
+    gaps, hidden, bias_sigma = motion.gaps, motion.hidden_rad2, motion.bias_sigma_rad_s
+    at_rest = record.in_first_second & (not motion.start_motion) & (np.cumsum(hidden) < LOST_RAD**2)
     acceleration = quaternion.rotate(q_gyro, record.acceleration_m_s2)
     drift = max(model.gyro_drift_rad_s, bias_sigma)
     up = direction_up(Steady(time_s, dt_s, acceleration, at_rest, gaps, hidden, drift), offline=offline)
     part = _UP_STEP * np.minimum(dt_s / float(np.median(dt_s)), _LONGEST_UP_STEP)
     q_level = _level_attitudes(q_gyro, up, np.where(up.fresh, 1.0, part))
-    lag, field_T, start_tilt = 0.0, record.field_T, 0.0
+    lag, field_T, start_tilt = magnetometer_lag(record, motion), record.field_T, 0.0
     if record.has_field:
-        lag = _lag_s(q_gyro, record)
         field_T = _remove_lag(q_gyro, time_s, field_T, lag)
-        best = float(up.sigma_rad[read["magnetometer"]].min())
+        has_field = motion.read["magnetometer"]
+        best = float(up.sigma_rad[has_field].min())
         useful = up.sigma_rad <= max(_USEFUL_TILT_RAD, 1.5 * best)
         for before, after in gaps:
             useful[before + 1 : after] = False
         field_T = np.where(useful[:, None], field_T, np.nan)
-        start_tilt = float(up.sigma_rad[np.argmax(useful & read["magnetometer"])])
+        start_tilt = float(up.sigma_rad[np.argmax(useful & has_field)])
     more_rad2 = up.sigma_rad**2 + (GRAVITY_TIME_S * bias_sigma) ** 2 + up.drift_rad**2
-    hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
     return PreparedReadings(
         time_s,
         rate,
-        bias,
+        motion.bias_rad_s,
         field_T,
         q_level,
         lag,
@@ -253,7 +295,7 @@ def prepare(
         up.hidden_rad2,
         start_tilt,
         bias_sigma,
-        (*_start_warnings(moves, bias_sigma), *gap_warnings(time_s, read, gaps[np.array(hides, np.bool_)])),
+        motion.warnings,
     )
 
 
@@ -278,14 +320,6 @@ def _level_attitudes(q_gyro: FloatArray, up: Up, part: FloatArray) -> FloatArray
     return q_level
 
 
-def _start_warnings(moves: str, bias_sigma_rad_s: float) -> list[str]:
-    """Return a warning if the first second is not at rest."""
-    if not moves:
-        return []
-    never = ", and it never rests, so that the gyro's bias is unknown" if bias_sigma_rad_s else ""
-    return [f"the unit is not at rest in the first second ({moves}){never}; the start is estimated with a larger σ"]
-
-
 def _tilt_sigma_rad(
     dt_s: FloatArray, rate: FloatArray, hidden_rad2: FloatArray, model: HeadingModel, more_rad: FloatArray
 ) -> FloatArray:
@@ -296,37 +330,14 @@ def _tilt_sigma_rad(
     return np.minimum(sigma, UNKNOWN_RAD)
 
 
-def magnetometer_lag(record: InertialMagneticRecord) -> float:
-    """Return the lag of the magnetometer behind the gyro [s]; zero without a magnetometer or rotations."""
+def magnetometer_lag(record: InertialMagneticRecord, motion: RecordMotion) -> float:
+    """Return the lag of the magnetometer behind the gyro [s]; zero without a magnetometer or rotations.
+
+    With it, the field in a fixed frame changes least within a fifth of a second. Readings with another length than in
+    the first second are not used, because a magnet on the sensor rotates with it.
+    """
     if not record.has_field:
         return 0.0
-    rate = step_rates(_extend_to_start(record.rate_rad_s - rest_bias(record)), record.dt_s, record.gyro_samples)
-    return _lag_s(gyro_attitudes(rate, record.dt_s), record)
-
-
-def log_warnings(record: InertialMagneticRecord, model: HeadingModel) -> tuple[str, ...]:
-    """Return sentences on a start in motion and on gaps of the sensors."""
-    time_s, bias = record.time_s, rest_bias(record)
-    moves = start_motion(record, bias[0])
-    read = _sensors_read(record)
-    gaps = sensor_gaps(time_s, read["gyro"])
-    hidden = hidden_variance(time_s, record.rate_rad_s, gaps, model.gap_rad_s, model.long_gap_rad_s)
-    hides = [np.sum(hidden[before + 1 : after + 1]) > LOST_RAD**2 for before, after in gaps]
-    bias_sigma = _UNKNOWN_BIAS_RAD_S if moves and not bias.any() else 0.0
-    return (*_start_warnings(moves, bias_sigma), *gap_warnings(time_s, read, gaps[np.array(hides, np.bool_)]))
-
-
-def _sensors_read(record: InertialMagneticRecord) -> dict[str, BoolArray]:
-    """Return the rows (n,) with a reading of each sensor that the record has."""
-    read = {"gyro": is_read(record.rate_rad_s), "accelerometer": is_read(record.acceleration_m_s2)}
-    return {**read, "magnetometer": is_read(record.field_T)} if record.has_field else read
-
-
-def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
-    """Return the lag for which the field in a fixed frame changes least within a fifth of a second.
-
-    Readings with another length than in the first second are not used, because a magnet on the sensor rotates with it.
-    """
     time_s, field_T = record.time_s, record.field_T
     rows = np.flatnonzero(is_read(field_T))
     step = float(np.median(record.dt_s))
@@ -341,7 +352,7 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
         n_rows=len(rows),
         apart=apart,
         time=np.ascontiguousarray(time_s),
-        q=np.ascontiguousarray(q_gyro),
+        q=np.ascontiguousarray(motion.q_gyro),
         field=np.ascontiguousarray(field_T),
         rows=np.ascontiguousarray(rows),
         is_good=good.astype(np.uint8),

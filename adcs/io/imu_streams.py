@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from os import PathLike
 from typing import Any
 
@@ -17,7 +18,7 @@ from arrays.io.csv import Table, table_of_header, table_of_text
 from arrays.io.errors import InputError
 from arrays.io.toml import read_toml, section_of
 from arrays.typing import FloatArray
-from magloc.live.tally import Tally
+from magloc.live.tally import Clock, Tally
 from magloc.live.transports import open_stream
 
 _EXPECTED = "a header with a time, and columns of gyro, accelerometer and magnetometer"
@@ -26,7 +27,8 @@ _EXPECTED = "a header with a time, and columns of gyro, accelerometer and magnet
 class ImuStream:
     """Filter of the rows of a stream: CSV below a header, or JSON objects with these names.
 
-    A line that is no row, and a row that the filter refuses, is counted and named; it never ends the stream.
+    A line that is no row, a row whose time jumps, and a row that the filter refuses, is counted and named; it never
+    ends the stream. After ten rows of a clock that was set back, the filter starts anew.
 
     Parameters
     ----------
@@ -43,7 +45,8 @@ class ImuStream:
     ) -> None:
         given = None if layout is None else section_of(str(layout), read_toml(layout, "a layout of a log"), ImuFile).log
         self.tally = Tally()
-        self._given, self._magnet, self._lag_s = given, magnet, lag_s
+        self._clock = Clock(self.tally, self._start)
+        self._given, self._config = given, AttitudeConfig(magnet, lag_s=lag_s)
         self._head: Table | None = None
         self._layout: LogLayout | None = None if given is None else layout_of_table(given)
         self._filter: AttitudeFilter | None = None
@@ -73,12 +76,13 @@ class ImuStream:
             self._n_lines += 1
             try:
                 row = self._row(line, name)
-                if row is not None:
-                    yield self._update(row)
+                estimate = None if row is None else self._update(*row)
             except ValueError as error:
-                reason = str(error)
-                self._fault = self._fault or reason.rstrip(".")
-                self.tally.name("late" if "time_s must ascend" in reason else "garbled", reason)
+                self._fault = self._fault or str(error).rstrip(".")
+                self.tally.name("garbled", str(error))
+                continue
+            if estimate is not None:
+                yield estimate
 
     def _row(self, line: bytes, name: str) -> tuple[float, dict[str, FloatArray]] | None:
         """Return time and readings of a line; None for a header and an empty line."""
@@ -117,15 +121,24 @@ class ImuStream:
         self._head, self._layout = head, layout
         if self._filter is None:
             samples: Any = table.gyro.samples
-            self._filter = AttitudeFilter(AttitudeConfig(self._magnet, samples, self._lag_s))
+            self._config = replace(self._config, gyro_samples=samples)
+            self._start()
 
-    def _update(self, row: tuple[float, dict[str, FloatArray]]) -> AttitudeEstimate:
-        time_s, readings = row
+    def _start(self) -> None:
+        """Start a filter."""
+        self._filter = AttitudeFilter(self._config)
+
+    def _update(self, time_s: float, readings: dict[str, FloatArray]) -> AttitudeEstimate | None:
+        """Return the estimate of a row; None if the clock does not accept its time."""
+        if not self._clock.accepts(time_s):
+            return None
         assert self._filter is not None
         names = ("rate_rad_s", "acceleration_m_s2", "field_T")
-        estimate = self._filter.update(time_s, *(readings.get(name) for name in names))
-        self.tally.rows += 1
-        return estimate
+        try:
+            return self._filter.update(time_s, *(readings.get(name) for name in names))
+        except ValueError:
+            self.tally.rows -= 1  # the clock counted it
+            raise
 
 
 def _object_of(text: str, place: str) -> dict[str, float | None]:

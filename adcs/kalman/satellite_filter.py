@@ -18,9 +18,8 @@ from adcs.kalman.initialisation import KNOWN_RAD, largest_deviation_rad, vector_
 from adcs.kalman.mekf import filter_problem
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import SENSORS
-from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part
+from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part, single_reading
 from arrays.io.errors import check_positive
-from arrays.io.values import numbers
 from arrays.typing import FloatArray
 from magloc import core
 from magloc.saved_states import read_sealed, seal
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
 
 SILENT_S = 60.0
 """Time without a reading of a sensor after which the estimate has a flag."""
+_LARGEST_FIELD_T = 1.0  # a larger one is in another unit
 _VERSION = 1
 _ONLY = np.array([0])
 _UNUSED = start_near(quaternion.IDENTITY[None], np.zeros((1, 3)), 1.0, 1.0)  # by a filter that goes on
@@ -177,8 +177,8 @@ class SatelliteFilter:
         Raises
         ------
         ValueError
-            The time does not ascend, a reading is infinite, has no direction or another shape, or the filter diverges.
-            The filter is then as before the call.
+            The time does not ascend, a reading is infinite, has no direction or another shape, a field is larger than
+            1 T, or the filter diverges. The filter is then as before the call.
         """
         time_s, before = float(time_s), self._progress
         if not (math.isfinite(time_s) and time_s > before.last_s):
@@ -234,7 +234,7 @@ class SatelliteFilter:
             saved = dict(state["settings"])
             sensors = SensorSet(**{**saved["sensors"], "states": tuple(saved["sensors"]["states"])})
             settings = FilterSettings(**{**saved, "sensors": sensors, "noise": ProcessNoise(**saved["noise"])})
-            chosen = EstimatorSettings(settings, longest_gap_s=state["longest_gap_s"])
+            chosen = EstimatorSettings(settings, longest_gap_s=float(state["longest_gap_s"]))
             found = cls(satellite, sensors=chosen, step_s=state["step_s"])
             numbers_ = np.frombuffer(content, dtype=np.float64)
             first_s, last_s, n_taken = numbers_[:3]
@@ -265,8 +265,7 @@ class SatelliteFilter:
         columns = {name: np.stack([values] if is_first else [last[name], values]) for name, values in now.items()}
         times = [time_s] if is_first else [before.last_s, time_s]
         covariance = np.full((len(times), 3, 3), np.nan)
-        if star_covariance_rad2 is not None:
-            covariance[-1] = star_covariance_rad2
+        covariance[-1] = single_reading("star_covariance_rad2", star_covariance_rad2, (3, 3))
         log = Telemetry(times, **columns, star_covariance_rad2=covariance, step_s=self.step_s)
         return log.record(self.satellite, time_s if is_first else before.first_s)
 
@@ -336,12 +335,14 @@ class _Progress:
 
 def _reading(name: str, value: Any) -> FloatArray:
     """Return a reading (k,); NaN where it is missing."""
-    width = 4 if name == "star" else 3
-    if value is None:
-        return np.full(width, np.nan)
-    found = numbers(value.as_quat() if hasattr(value, "as_quat") else value)
-    if found.shape != (width,):
-        raise ValueError(f"Input {name} must have shape ({width},); instead received {found.shape}.")
+    if name == "star":
+        return single_reading(name, value.as_quat() if hasattr(value, "as_quat") else value, (4,))
+    found = single_reading(name, value)
+    if name == "field_T" and (np.abs(found) > _LARGEST_FIELD_T).any():
+        raise ValueError(
+            f"Input field_T must be at most {_LARGEST_FIELD_T:g} T; instead received {found.tolist()}. "
+            "Convert it to tesla."
+        )
     return found
 
 

@@ -324,6 +324,16 @@ class Telemetry:
         return _filter_instants(self.time_s, self.step_s)[0]
 
 
+def single_reading(name: str, value: ArrayLike | None, shape: tuple[int, ...] = (3,)) -> FloatArray:
+    """Return a reading of a caller, NaN where it is missing; ValueError if it has another shape."""
+    if value is None:
+        return np.full(shape, np.nan)
+    found = numbers(value)
+    if found.shape != shape:
+        raise ValueError(f"Input {name} must have shape {shape}; instead received {found.shape}.")
+    return found
+
+
 def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
     """Return the readings of a sensor, NaN where one of their components is missing."""
     shape = (n, 4 if name == "star" else 3)

@@ -29,6 +29,12 @@ def objects() -> list[str]:
     return [json.dumps(dict(zip(header, map(float, line.split(",")), strict=True))) for line in LINES[1:]]
 
 
+def shifted(line: str, by_s: float) -> str:
+    """Row with another time."""
+    time_s, rest = line.split(",", 1)
+    return f"{float(time_s) + by_s!r},{rest}"
+
+
 class TestStream:
     @pytest.mark.parametrize("form", ["csv", "json"])
     def test_the_filters_numbers(self, form: str) -> None:
@@ -38,12 +44,37 @@ class TestStream:
         assert [one.flags for one in found] == [one.flags for one in expected()]
 
     def test_bad_lines_end_nothing(self) -> None:
-        late, cut = LINES[150], LINES[300][:20]
-        lines = [*LINES[:200], "hello", late, "{", "[1]", "\xff", cut, LINES[0], *LINES[200:]]
+        late, cut = shifted(LINES[150], 0.001), LINES[300][:20]
+        lines = [*LINES[:200], "hello", late, LINES[150], "{", "[1]", "\xff", cut, LINES[0], *LINES[200:]]
         stream = ImuStream()
         found = list(stream.parse([line.encode("latin-1") for line in lines], "lines"))
         np.testing.assert_allclose(found[-1].q, expected()[-1].q, rtol=0, atol=1e-9)
         assert (stream.tally.rows, stream.tally.late, stream.tally.garbled) == (len(LINES) - 1, 1, 5)
+        assert stream.tally.doubled == 1
+
+    def test_a_wrong_time_costs_a_row(self) -> None:
+        lines = [*LINES[:200], shifted(LINES[200], 1e6), *LINES[201:]]
+        stream = ImuStream()
+        found = list(stream.parse([line.encode() for line in lines], "lines"))
+        assert (len(found), stream.tally.rows, stream.tally.garbled) == (len(LINES) - 2, len(LINES) - 2, 1)
+        others = [line.encode() for line in [*LINES[:200], *LINES[201:]]]
+        np.testing.assert_array_equal(found[-1].q, [*ImuStream().parse(others, "lines")][-1].q)
+
+    def test_a_clock_that_is_set_back(self) -> None:
+        """The filter starts anew with the tenth row."""
+        stream = ImuStream()
+        lines = [*LINES[:200], *(shifted(line, -1e3) for line in LINES[1:])]
+        found = list(stream.parse([line.encode() for line in lines], "lines"))
+        assert (stream.tally.rows, stream.tally.late, stream.tally.restarts) == (len(lines) - 10, 9, 1)
+        anew = [line.encode() for line in [LINES[0], *lines[209:]]]
+        np.testing.assert_array_equal(found[-1].q, [*ImuStream().parse(anew, "lines")][-1].q)
+
+    def test_a_row_that_the_filter_refuses(self) -> None:
+        """A field of zero is no reading."""
+        stream = ImuStream()
+        zero = ",".join([*LINES[200].split(",")[:7], "0", "0", "0"])
+        assert len(list(stream.parse([line.encode() for line in [*LINES[:200], zero]], "lines"))) == 199
+        assert (stream.tally.rows, stream.tally.garbled) == (199, 1)
 
 
 class TestCommand:

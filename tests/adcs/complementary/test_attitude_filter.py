@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 import adcs
 from adcs import quaternion
 from adcs.complementary.attitude_filter import FLAGS, AttitudeFilter
-from adcs.complementary.heading import HeadingModel
+from adcs.complementary.heading import HeadingModel, heading_track, rotate_to_north
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare
 from adcs.complementary.names import MAGNETS
 from adcs.complementary.orientation_errors import orientation_errors
 from adcs.io.imu_files import read_imu
@@ -109,6 +110,50 @@ class TestBatch:
             np.testing.assert_array_equal(one.update(time_s, *readings).q, other.update(time_s, *none).q)
 
 
+class TestReference:
+    @pytest.mark.parametrize("seed", [30, 31])
+    @pytest.mark.parametrize("kind", ["plain", "magnet", "room", "gaps"])
+    def test_the_filter_in_numpy(self, kind: str, seed: int) -> None:
+        """From 2 s on the attitudes agree within a tenth of σ, σ to 2 %, and the same fields are left out.
+
+        The filter in NumPy knows the usual steps from the start, and the filter for one reading learns them.
+        """
+        time_s, rate, acceleration, field_T, q = unit_log(seed, seconds=40.0)
+        late, magnet = time_s > 15.0, np.array([6e-6, -4e-6, 19e-6])
+        if kind == "magnet":
+            field_T[late] += magnet
+        elif kind == "room":
+            field_T[late] += quaternion.rotate_back(q[late], magnet)
+        elif kind == "gaps":
+            field_T[late & (time_s < 25.0)] = np.nan
+            acceleration[(time_s > 28.0) & (time_s < 30.0)] = np.nan
+        ready = prepare(InertialMagneticRecord(time_s, rate, acceleration, field_T))
+        heading = heading_track(
+            time_s,
+            ready.rate_rad_s,
+            ready.q_level,
+            ready.field_T,
+            hidden_rad2=ready.hidden_rad2,
+            start_tilt_rad=ready.start_tilt_rad,
+        )
+        filter_ = AttitudeFilter(adcs.AttitudeConfig(lag_s=ready.lag_s))
+        found = estimates(filter_, (time_s, rate, acceleration, field_T, q))[time_s > 2.0]
+        expected, tilt, of_heading, left_out = (
+            values[time_s > 2.0]
+            for values in (
+                rotate_to_north(ready.q_level, heading.heading_rad),
+                ready.tilt_sigma_rad,
+                heading.sigma_rad,
+                heading.left_out,
+            )
+        )
+        apart = quaternion.angle_between(found[:, :4], expected)
+        assert (apart < 0.1 * np.hypot(tilt, of_heading)).all()
+        np.testing.assert_allclose(found[:, 4:6], np.stack([tilt, of_heading], axis=1), rtol=0.02)
+        np.testing.assert_array_equal(found[:, 15].astype(int) >> FLAGS.index("field-left-out") & 1, left_out)
+        assert left_out.any() == (kind in ("magnet", "room"))
+
+
 class TestState:
     @pytest.mark.parametrize("begin", [0, 1, 10, 40, 250, 400, 500])
     def test_resumes_bit_for_bit(self, begin: int) -> None:
@@ -133,6 +178,8 @@ class TestState:
         ):
             with pytest.raises(ValueError, match=words):
                 AttitudeFilter.from_state({**state, **change})
+        with pytest.raises(ValueError, match=r"must be one of AttitudeFilter.state\(\); instead received a list"):
+            AttitudeFilter.from_state([state])  # type: ignore[arg-type]
 
 
 class TestInput:
@@ -145,6 +192,8 @@ class TestInput:
             ({1: [0.0, math.inf, 0.0]}, "gyro_rad_s must be at most 1e4"),
             ({2: [0.0, 0.0, 0.0]}, "acceleration_m_s2 must have a length"),
             ({3: [0.0, 0.0, 50.0]}, "field_T must have a length, at most 1 T"),
+            ({1: [0.0, 0.0]}, r"gyro_rad_s must have shape \(3,\); instead received \(2,\)"),
+            ({2: 9.8}, r"acceleration_m_s2 must have shape \(3,\); instead received \(\)"),
         ],
     )
     def test_bad_input_changes_nothing(self, change: dict[int, object], words: str) -> None:
@@ -209,6 +258,8 @@ class TestConfig:
     def test_defaults_are_those_of_the_header(self) -> None:
         """In name, order and value: the kernel copies them as they lie."""
         text = (HEADERS / "field_heading.hpp").read_text(encoding="utf-8")
+        of_state = (HEADERS / "attitude_filter.hpp").read_text(encoding="utf-8")
+        assert f"uint32_t version = {AttitudeFilter().state()['version']};" in of_state
         struct = re.search(r"struct HeadingParameters \{(.*?)\};", text, re.DOTALL)
         assert struct is not None
         found = {name: float(value) for name, value in re.findall(r"(\w+) = Real\(([-\d.e]+)\)", struct[1])}
@@ -228,6 +279,11 @@ class TestConfig:
             for one in (config, replace(config, lag_s=0.0))
         ]
         assert totals[0] < totals[1]
+
+    def test_a_log_with_wrong_axes(self) -> None:
+        time_s, gyro, acceleration, field_T, _ = unit_log(11, seconds=60.0)
+        with pytest.raises(ValueError, match=r"field_T must turn as the other sensors do.*its axes x and y exchanged"):
+            adcs.AttitudeConfig.from_log(time_s, gyro, acceleration, field_T[:, [1, 0, 2]])
 
     def test_refusals(self) -> None:
         with pytest.raises(ValueError, match=r"lag_s must be within 0 and 0\.04 s; instead received 1\.0"):

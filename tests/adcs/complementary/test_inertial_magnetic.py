@@ -325,12 +325,16 @@ class TestInput:
             InertialMagneticRecord(0.0 * time_s, good, good, good)
         with pytest.raises(ValueError, match="time_s must cover a second at least"):
             InertialMagneticRecord(time_s[:50], good[:50], good[:50], good[:50])
-        with pytest.raises(ValueError, match="field_T must be finite, of shape"):
+        with pytest.raises(
+            ValueError, match=r"field_T must be finite, of shape \(200, 3\); instead received an infinite value"
+        ):
             InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.inf))
         with pytest.raises(ValueError, match="field_T must have a reading within the first second"):
             InertialMagneticRecord(time_s, good, good, np.where(time_s[:, None] < 1.5, np.nan, good))
+        with pytest.raises(ValueError, match=r"must not exceed 1 T; instead received 43\. Convert it to T"):
+            InertialMagneticRecord(time_s, good, good, 43.0 * good)
         assert not InertialMagneticRecord(time_s, good, good, np.full((200, 3), np.nan)).has_field
-        with pytest.raises(ValueError, match="rate_rad_s must not exceed 10000"):
+        with pytest.raises(ValueError, match=r"rate_rad_s must not exceed 10000 rad/s; instead received 1e\+18"):
             InertialMagneticRecord(time_s, 1e18 * good, good, good)
         with pytest.raises(ValueError, match="acceleration_m_s2 must have a length"):
             InertialMagneticRecord(time_s, good, np.zeros((200, 3)), good)

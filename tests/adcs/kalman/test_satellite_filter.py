@@ -189,6 +189,8 @@ class TestInput:
             (1.0, {"field_T": [1e-5, 2e-5]}, r"field_T must have shape \(3,\); instead received \(2,\)"),
             (1.0, {"sun": [0.0, 0.0, 0.0]}, "sun must have a direction"),
             (1.0, {"star": [0.0, 0.0, 0.0, 1.0], "star_covariance_rad2": -np.eye(3)}, "positive definite"),
+            (1.0, {"star": [0.0, 0.0, 0.0, 1.0], "star_covariance_rad2": [1e-9] * 3}, r"must have shape \(3, 3\)"),
+            (1.0, {"field_T": [2e4, 1e4, 3e4]}, "field_T must be at most 1 T; instead received .* Convert it to tesla"),
             (1.0, {"gyro_rad_s": [1e200, 0.0, 0.0]}, "instead the filter diverges"),
         ],
     )

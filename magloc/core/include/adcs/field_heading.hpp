@@ -99,7 +99,6 @@ class FieldHeading {
   HeadingMinute<Real> minute_;
 
  public:
-  bool has_heading() const { return has_heading_; }
   static Real angle(const Vector<Real> &level) { return Real(arc_tangent(double(-level[0]), double(level[1]))); }
   void begin(double time) { began_ = sums_.time = time; }
 

@@ -193,7 +193,6 @@ class GyroSteps {
     is_read_ = true;
     add(rate);
   }
-  // Forget a step before the first sample.
   bool has_sample() const { return count_ > 0; }
 
  private:
