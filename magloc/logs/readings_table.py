@@ -104,6 +104,8 @@ def _in_rows(time_s: FloatArray, channel: LogChannel, columns: LogColumns | None
         after = np.clip(np.searchsorted(channel.time_s, time_s), 1, max(len(values) - 1, 1))
         is_before = time_s - channel.time_s[after - 1] < channel.time_s[np.minimum(after, len(values) - 1)] - time_s
         return np.asarray(values[np.minimum(after, len(values) - 1) - (is_before & (len(values) > 1))])
+    sample_s = channel.time_s
     if columns is not None and channel.name in (columns.angles or ()):
-        values = np.unwrap(values, period=360.0)
-    return resample(time_s, channel.time_s, values[:, None])[:, 0]
+        known = np.isfinite(values)  # a missing angle would make all later ones missing
+        sample_s, values = sample_s[known], np.unwrap(values[known], period=360.0)
+    return resample(time_s, sample_s, values[:, None])[:, 0]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from arrays.io.errors import InputError
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.logs.channels import Log
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _XYZ = ("x", "y", "z")
 _LEAST_RATE_Hz = 10.0  # slower topics are for supervision
+_UNIT_WITHIN = 0.1  # largest error of the length of a quaternion
 _GYROS = (
     r"sensor_combined\.gyro_rad\[0\]",
     r"vehicle_imu(\[\d+\])?\.delta_angle\[0\]",
@@ -151,6 +152,11 @@ def axes_of(name: str) -> tuple[str, str, str]:
     return stem + x, stem + y, stem + z
 
 
+def are_attitudes(quaternions: FloatArray) -> BoolArray:
+    """Return the rows (n,) of quaternions (n, 4) whose length is 1 to a tenth."""
+    return np.asarray(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < _UNIT_WITHIN)
+
+
 def _own_attitude(log: Log) -> tuple[FloatArray, Rotation] | None:
     """Return times and attitudes that the log states; None if it states none."""
     from scipy.spatial.transform import Rotation
@@ -161,7 +167,7 @@ def _own_attitude(log: Log) -> tuple[FloatArray, Rotation] | None:
     angles = [f"ATT.{name}" for name in ("Yaw", "Pitch", "Roll")]
     if set(quaternions) <= set(log):
         time_s, values = log.vectors(quaternions)
-        is_whole = np.isfinite(values).all(axis=1) & (np.abs(np.linalg.norm(values, axis=1) - 1.0) < 0.1)
+        is_whole = are_attitudes(values)
         return (time_s[is_whole], enu_from_ned * Rotation.from_quat(values[is_whole])) if is_whole.any() else None
     if set(angles) <= set(log):
         time_s, values = log.vectors(angles)

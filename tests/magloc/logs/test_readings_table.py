@@ -29,6 +29,26 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+def drive(q: np.ndarray) -> bytes:
+    """Return a drive of 10 s to the north with readings at 50 Hz, places at 5 Hz and these quaternions at 50 Hz."""
+    us = np.arange(0, 10_000_000, 20_000, dtype=np.uint64)
+    gps = {
+        "timestamp": us[::10],
+        "lat": np.round(1e7 * (48.0 + np.degrees(1e-6 * us[::10].astype(float) / 6.3674e6))).astype(np.int32),
+        "lon": np.full(len(us[::10]), 110_000_000, np.int32),
+        "alt": np.full(len(us[::10]), 500_000, np.int32),
+    }
+    mag = {"timestamp": us + np.uint64(7_000), "magnetometer_ga": np.tile(np.float32([0.2, 0.01, 0.43]), (len(us), 1))}
+    mag["magnetometer_ga"][:, 0] += np.linspace(0.0, 0.01, len(us), dtype=np.float32)
+    return ulog(
+        [
+            ("vehicle_gps_position", 0, gps),
+            ("vehicle_magnetometer", 0, mag),
+            ("vehicle_attitude", 0, {"timestamp": us, "q": q.astype(np.float32)}),
+        ]
+    )
+
+
 @pytest.mark.parametrize(("name", "error_T"), [("flight.ulg", 1e-11), ("flight.BIN", 5.1e-8)])
 def test_the_proposed_table_reads_the_flight(run, folder: Path, name: str, error_T: float) -> None:
     """DataFlash has whole milligauss, 100 nT."""
@@ -44,24 +64,9 @@ def test_the_proposed_table_reads_the_flight(run, folder: Path, name: str, error
 
 def test_places_and_angles_come_to_the_rows_of_the_sensor(run, tmp_path: Path) -> None:
     """A vehicle that drives to the north at 1 m/s and turns from 350 to 10 degrees."""
-    us = np.arange(0, 10_000_000, 20_000, dtype=np.uint64)
-    gps_us = np.arange(0, 10_000_000, 200_000, dtype=np.uint64)
-    yaw = np.radians(350.0 + 2e-6 * us)
-    q = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1).astype(np.float32)
-    north_m = 1e-6 * gps_us.astype(float)
-    gps = {
-        "timestamp": gps_us,
-        "lat": np.round(1e7 * (48.0 + np.degrees(north_m / 6.3674e6))).astype(np.int32),
-        "lon": np.full(len(gps_us), 110_000_000, np.int32),
-        "alt": np.full(len(gps_us), 500_000, np.int32),
-    }
-    mag = {"timestamp": us + np.uint64(7_000), "magnetometer_ga": np.tile(np.float32([0.2, 0.01, 0.43]), (len(us), 1))}
-    mag["magnetometer_ga"][:, 0] += np.linspace(0.0, 0.01, len(us), dtype=np.float32)
-    attitude = {"timestamp": us, "q": q}
+    yaw = np.radians(350.0 + 2.0 * 0.02 * np.arange(500))
     path = tmp_path / "drive.ulg"
-    path.write_bytes(
-        ulog([("vehicle_gps_position", 0, gps), ("vehicle_magnetometer", 0, mag), ("vehicle_attitude", 0, attitude)])
-    )
+    path.write_bytes(drive(np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], 1)))
     assert run("columns", path, "--out", tmp_path / "a.toml").status == 0
     readings = magloc.read_readings(path, arrays.read_sensors(tmp_path / "a.toml"))
     checked = run("qc", path, "--array", tmp_path / "a.toml", "--json")
@@ -71,6 +76,25 @@ def test_places_and_angles_come_to_the_rows_of_the_sensor(run, tmp_path: Path) -
     heading = np.radians(350.0 + 2.0 * readings.time_s[inside])
     nose = readings.array_rotation[np.flatnonzero(inside)].apply([1.0, 0.0, 0.0])
     np.testing.assert_allclose(nose, np.stack([np.sin(heading), np.cos(heading), 0 * heading], 1), atol=1e-3)
+
+
+@pytest.mark.parametrize("missing", [0.0, np.nan])
+def test_rows_without_an_attitude_are_left_out(
+    run, tmp_path: Path, caplog: pytest.LogCaptureFixture, missing: float
+) -> None:
+    """An estimator that has no attitude from 2 to 4 s logs zeros or NaN; the rows before and after stay."""
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (500, 1))
+    q[100:200] = missing
+    path = tmp_path / "drive.ulg"
+    path.write_bytes(drive(q))
+    assert run("columns", path, "--out", tmp_path / "a.toml").status == 0
+    caplog.clear()
+    time_s = magloc.read_readings(path, arrays.read_sensors(tmp_path / "a.toml")).time_s
+    expected_s = 0.007 + 0.02 * np.arange(500)
+    expected_s = expected_s[((expected_s < 1.98) | (expected_s > 4.0)) & (expected_s < 9.8)]
+    np.testing.assert_allclose(time_s, expected_s, atol=1e-9)
+    # 101 rows lie between the attitudes at 1.98 s and 4.00 s; the last row is later than all attitudes.
+    assert "drive.ulg: 102 rows are outside the attitude or in its gaps" in caplog.text
 
 
 def test_paths_of_hdf5(tmp_path: Path) -> None:
