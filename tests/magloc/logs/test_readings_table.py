@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import h5py
@@ -95,6 +96,40 @@ def test_rows_without_an_attitude_are_left_out(
     np.testing.assert_allclose(time_s, expected_s, atol=1e-9)
     # 101 rows lie between the attitudes at 1.98 s and 4.00 s; the last row is later than all attitudes.
     assert "drive.ulg: 102 rows are outside the attitude or in its gaps" in caplog.text
+
+
+def test_the_origin_is_the_first_place_without_an_attitude(run, tmp_path: Path) -> None:
+    path = tmp_path / "drive.ulg"
+    path.write_bytes(drive(np.full((500, 4), np.nan)))
+    assert run("columns", path, "--out", tmp_path / "a.toml").status == 0
+    columns = arrays.read_sensors(tmp_path / "a.toml").columns
+    assert origin_of_log(path, columns) == pytest.approx((48.0, 11.0, 500.0))
+
+
+def test_a_log_that_is_read_for_its_origin_warns_once(run, tmp_path: Path) -> None:
+    q = np.tile([1.0, 0.0, 0.0, 0.0], (500, 1))
+    q[100:200] = np.nan
+    path, array_file = tmp_path / "drive.ulg", tmp_path / "a.toml"
+    path.write_bytes(drive(q))
+    assert run("columns", path, "--out", array_file).status == 0
+    lines = array_file.read_text(encoding="utf-8").splitlines()
+    array_file.write_text("\n".join(line for line in lines if not line.startswith("origin")), encoding="utf-8")
+    outcome = run("qc", path, "--array", array_file)
+    assert outcome.status == 0
+    assert outcome.err.count("rows are outside the attitude") == 1
+
+
+def test_an_attitude_whose_clock_goes_back_is_refused(run, tmp_path: Path) -> None:
+    data = drive(np.tile([1.0, 0.0, 0.0, 0.0], (500, 1)))
+    path = tmp_path / "drive.ulg"
+    path.write_bytes(data)
+    assert run("columns", path, "--out", tmp_path / "a.toml").status == 0
+    at = data.rindex(struct.pack("<Q", 9_980_000) + np.float32(1.0).tobytes())  # the last attitude
+    path.write_bytes(data[:at] + struct.pack("<Q", 3_000_000) + data[at + 8 :])
+    outcome = run("qc", path, "--array", tmp_path / "a.toml")
+    assert outcome.status == 2
+    assert "drive.ulg: found 3.000000 s after 9.960000 s in row 500 of vehicle_attitude.yaw_deg" in outcome.err
+    assert "cut the log there" in outcome.err
 
 
 def test_paths_of_hdf5(tmp_path: Path) -> None:
