@@ -95,7 +95,7 @@ def find_sensors(log: Log) -> LogSensors:
     """
     gyro, accelerometer = _inertial(log, "gyro", _GYROS), _inertial(log, "accelerometer", _ACCELEROMETERS)
     found = list(_candidates(log, _MAGNETOMETERS))
-    working = [sensor for sensor in found if np.ptp(sensor.values, axis=0).any()]
+    working = [sensor for sensor in found if readings_vary(sensor.values)]
     warnings = [
         f"{log.path}: the magnetometer {sensor.name} stands at {sensor.values[0].tolist()} T and is left out"
         for sensor in found
@@ -118,7 +118,7 @@ def _inertial(log: Log, kind: str, patterns: Sequence[str]) -> VectorReadings:
         raise InputError(f"{log.path}: found no {kind}, expected {expected}.")
     fast = (each for each in found if log[each.name].rate_Hz >= _LEAST_RATE_Hz)
     chosen = next(fast, max(found, key=lambda each: len(each.time_s)))
-    if not np.ptp(chosen.values, axis=0).any():
+    if not readings_vary(chosen.values):
         values = chosen.values[0].tolist()
         raise InputError(f"{log.path}: found a {kind} {chosen.name} that stands at {values}, expected one that works.")
     return chosen
@@ -140,6 +140,12 @@ def _candidates(log: Log, patterns: Sequence[str]) -> Iterator[VectorReadings]:
                 over_s = log.vectors([*names, f"{topic}.delta_{kind}_dt"])[1][:, 3:]
                 values = values / np.where(over_s > 0.0, over_s, np.nan)
             yield VectorReadings(name, time_s, values)
+
+
+def readings_vary(values: FloatArray) -> bool:
+    """Return whether the complete rows of readings (n, k) differ; those of a dead sensor are equal or missing."""
+    known = values[np.isfinite(values).all(axis=1)]
+    return len(known) > 0 and bool(np.ptp(known, axis=0).any())
 
 
 def axes_of(name: str) -> tuple[str, str, str]:

@@ -98,6 +98,18 @@ def test_rows_without_an_attitude_are_left_out(
     assert "drive.ulg: 102 rows are outside the attitude or in its gaps" in caplog.text
 
 
+def test_a_sensor_with_missing_readings_is_proposed(run, tmp_path: Path) -> None:
+    """One reading of each axis is missing; the sensor works."""
+    path = tmp_path / "drive.ulg"
+    data = drive(np.tile([1.0, 0.0, 0.0, 0.0], (500, 1)))
+    reading = struct.pack("<Q", 2_007_000)
+    at = data.index(reading) + len(reading)
+    path.write_bytes(data[:at] + np.full(3, np.nan, np.float32).tobytes() + data[at + 12 :])
+    outcome = run("columns", path)
+    assert 's1 = ["vehicle_magnetometer.magnetometer_ga[0]", ' in outcome.out
+    assert "stands still" not in outcome.out
+
+
 def test_the_origin_is_the_first_place_without_an_attitude(run, tmp_path: Path) -> None:
     path = tmp_path / "drive.ulg"
     path.write_bytes(drive(np.full((500, 4), np.nan)))
