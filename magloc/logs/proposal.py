@@ -46,7 +46,9 @@ def propose_log_columns(log: Log) -> Proposal:
     about = f"{log.kind}. Channels, by the messages that share their times:"
     channels: dict[str, str] = {}
     for topic in log.topics:
-        channels[f"{topic.name} (own clock)" if topic.name in channels else topic.name or "table"] = _described(topic)
+        is_inside = topic.name in channels  # a sensor of the same message with a clock of its own
+        name = f"{topic.name} (own clock of {next(iter(topic.fields))})" if is_inside else topic.name or "table"
+        channels[name] = _described(topic)
     lines = (_FRONT_RIGHT_DOWN,) if is_autopilot else ()
     return Proposal(channels, keys, {key: tuple(names) for key, names in sensors.items()}, asked, 0, about, lines)
 

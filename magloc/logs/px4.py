@@ -90,6 +90,7 @@ def _topics(message: Any) -> Iterator[Topic]:
     units = {field: _unit(str(message.name), field) for field in fields}
     units = {field: unit for field, unit in units.items() if unit.logged}
     whole = Topic(name, _seconds(time_us), fields, units, "boot")
+    inside = []
     for sensor in ("accelerometer", "magnetometer"):
         later = columns.get(f"{sensor}_timestamp_relative")
         own = {field: of for field, of in fields.items() if field.startswith(f"{sensor}_") and "timestamp" not in field}
@@ -97,9 +98,10 @@ def _topics(message: Any) -> Iterator[Topic]:
             continue
         own_us = time_us + later
         is_new = (later != _NO_TIME) & (np.diff(own_us, prepend=-1) != 0)  # a sample stands until the next
-        yield replace(whole, time_s=_seconds(own_us[is_new]), fields={field: of[is_new] for field, of in own.items()})
+        values = {field: of[is_new] for field, of in own.items()}
+        inside.append(replace(whole, time_s=_seconds(own_us[is_new]), fields=values))
         fields = {field: of for field, of in fields.items() if field not in own}
-    yield replace(whole, fields=fields)
+    yield from (replace(whole, fields=fields), *inside)
 
 
 def _angles_deg(fields: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

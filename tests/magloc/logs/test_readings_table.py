@@ -186,6 +186,23 @@ def test_the_proposal_lists_all_messages_and_asks(run, folder: Path) -> None:
     assert "# Asked: no channels of a place were found" in said
 
 
+def test_the_proposal_lists_sensors_with_clocks_of_their_own(run, tmp_path: Path) -> None:
+    """Old messages of PX4 have an accelerometer and a magnetometer with clocks of their own."""
+    us, path = np.arange(0, 1_000_000, 10_000, dtype=np.uint64), tmp_path / "old.ulg"
+    of_sensor = {
+        f"{name}_timestamp_relative": np.full(len(us), later, np.int32)
+        for name, later in (("accelerometer", 1_000), ("magnetometer", 2_000))
+    }
+    readings = {
+        name: np.ones((len(us), 3), np.float32) for name in ("gyro_rad", "accelerometer_m_s2", "magnetometer_ga")
+    }
+    path.write_bytes(ulog([("sensor_combined", 0, {"timestamp": us, **readings, **of_sensor})]))
+    out = run("columns", path).out
+    assert "#   sensor_combined: 100 rows, 100 Hz: gyro_rad[0-2] [rad/s]" in out
+    assert "#   sensor_combined (own clock of accelerometer_m_s2[0]): 100 rows, 100 Hz: accelerometer_m_s2[0-2]" in out
+    assert "#   sensor_combined (own clock of magnetometer_ga[0]): 100 rows, 100 Hz: magnetometer_ga[0-2]" in out
+
+
 def test_a_log_states_its_date_by_its_receiver(data_folder: Path) -> None:
     """The receiver of the autopilot states the 21st of April 2021, 06:30 UTC, at the start."""
     path = data_folder / "flight-logs" / "sample_log_small.ulg"
