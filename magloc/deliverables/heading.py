@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from arrays.typing import FloatArray
+from magloc.measurement.plausibility import robust_sigma
 from magloc.navigation.flight_lines import FlightLine
 
 _ENDS = 0.15  # share of a line at either end that is left out: turns
@@ -16,7 +17,6 @@ _STRAIGHT = 0.95  # least distance between the ends over the way
 _FEWEST = 3  # lines with two neighbours on either side
 _SEEN = 0.2  # least size of a direction of courses relative to the largest
 _ROUNDS, _OUTLIER = 10, 2.0  # of the robust fit, and its threshold in standard deviations
-_GAUSSIAN = 1.4826
 _TINY_T = 1e-15  # residuals that are rounding errors
 _WEIGHTS = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 8.0  # of successive lines: their fourth difference
 
@@ -60,7 +60,7 @@ def heading_error(xy_m: FloatArray, values_T: FloatArray, lines: Sequence[Flight
     for _ in range(_ROUNDS):
         solve = np.linalg.pinv(columns * np.sqrt(weight)[:, None]) * np.sqrt(weight)
         residual = steps - columns @ (solve @ steps)
-        spread = _GAUSSIAN * float(np.median(np.abs(residual)))
+        spread = robust_sigma(residual)
         weight = np.minimum(1.0, (_OUTLIER * spread + _TINY_T) / (np.abs(residual) + _TINY_T))
     vector = solve @ steps
     dof = max(float(weight.sum()) - columns.shape[1], 1.0)

@@ -19,7 +19,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
 from magloc.deliverables.lag import clock_lag, without_ambient
 from magloc.localization.fit.prior import NOTHING_KNOWN
-from magloc.measurement.plausibility import EARTH_T, finite_median
+from magloc.measurement.plausibility import EARTH_T, finite_median, robust_sigma
 from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
 from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
@@ -38,7 +38,6 @@ _SIGNIFICANT = 3.0  # standard deviations of the lag and of the heading error
 _WIDE = 1.7  # times the spacing of lines
 _NEAR = 0.75  # distance of a covered place from a line, in spacings
 _FOURTH = math.sqrt(70.0)  # standard deviation of the fourth difference of white noise
-_GAUSSIAN = 1.4826  # standard deviation over the median of absolute values
 _CELLS_PER_SPACING, _MOST_CELLS = 10.0, 200_000
 _SHORTEST_GEOLOGY_M = 15.0
 
@@ -169,7 +168,7 @@ class Quality(Result):
 
     def noise_in(self, rows: slice | IntArray) -> FloatArray:
         """Return the noise of each sensor (N,) in some rows."""
-        return np.array([_spread(column) for column in self.fourth_T[rows].T])
+        return np.array([robust_sigma(column) for column in self.fourth_T[rows].T])
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
@@ -380,11 +379,6 @@ def _fourth_differences(time_s: FloatArray, values: FloatArray) -> FloatArray:
     beside = np.convolve(is_gap, np.ones(4), mode="valid") > 0.0
     out[2:-2][beside] = np.nan
     return out
-
-
-def _spread(values: FloatArray) -> float:
-    """Return the standard deviation of Gaussian values with outliers; NaN without any value."""
-    return _GAUSSIAN * finite_median(np.abs(values))
 
 
 def _level_share(rows: Readings) -> float:

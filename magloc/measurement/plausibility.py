@@ -359,3 +359,8 @@ def finite_median(values: FloatArray) -> float:
     """Return the median of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")
+
+
+def robust_sigma(residuals: FloatArray) -> float:
+    """Return σ of Gaussian residuals with outliers, by their median modulus; NaN without any."""
+    return 1.4826 * finite_median(np.abs(residuals))

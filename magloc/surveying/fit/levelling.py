@@ -10,6 +10,7 @@ from scipy.interpolate import BSpline
 from scipy.sparse.linalg import spsolve
 
 from arrays.typing import FloatArray
+from magloc.measurement.plausibility import robust_sigma
 from magloc.navigation.flight_lines import FlightLine, covers_area, line_spacing
 
 FEWEST_LINES = 4
@@ -18,7 +19,6 @@ _MOST_NODES = 40  # on each axis
 _MOST_ROWS = 20_000  # that the fit uses
 _DEGREE = 3
 _SMOOTH, _RIDGE = 1e-6, 1e-3  # penalties, relative to the information of the rows: the surface takes what both explain
-_MAD = 1.4826
 _HUBER, _TUKEY = 1.345, 4.685  # 95 % efficient for Gaussian errors
 _STEPS = 12
 
@@ -63,7 +63,7 @@ def line_levels(place_m: FloatArray, values: FloatArray, lines: Sequence[FlightL
         weighted = A.multiply(weights[:, None]).tocsr()
         solution = spsolve((weighted.T @ A + penalty).tocsc(), weighted.T @ (values[used] - middle))
         left = np.abs(values[used] - middle - A @ solution)
-        ratio = left / max(_MAD * float(np.median(left)), np.finfo(np.float64).tiny)
+        ratio = left / max(robust_sigma(left), np.finfo(np.float64).tiny)
         if number < _STEPS // 2:
             weights = np.minimum(1.0, _HUBER / np.maximum(ratio, _HUBER))
         else:
