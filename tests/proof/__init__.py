@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -122,13 +121,14 @@ def judged(
     """Return the row of errors (n,), of which those beyond a limit are wrong, with their claimed σ (n,) if any."""
     error = np.where(np.isfinite(error), np.abs(error), np.inf)
     share = float(np.mean(error > wrong))
-    if sigma is None:
-        return Row(case, tool, needs, error, share, seconds)
+    row = Row(case, tool, needs, error, share, seconds)
     known = np.isfinite(error)
-    squares = np.square(error[known] / sigma[known])
-    return Row(
-        case, tool, needs, error, share, seconds, float(np.mean(squares)), float(np.mean(squares < chdtri(1, 0.05)))
-    )
+    return row if sigma is None else with_nees(row, np.square(error[known] / sigma[known]))
+
+
+def with_nees(row: Row, squares: FloatArray, d: int = 1) -> Row:
+    """Return a row with the consistency of its squared errors (n,) over their covariance of d dimensions."""
+    return replace(row, nees=float(np.mean(squares)) / d, inside=float(np.mean(squares < chdtri(d, 0.05))))
 
 
 def judged_places(
@@ -149,8 +149,7 @@ def judged_places(
     known, d = np.isfinite(off).all(axis=1), off.shape[1]
     both = covariance[known] + truth_sigma**2 * np.eye(d)
     squares = np.vecdot(off[known], np.linalg.solve(both, off[known][..., None])[..., 0])
-    inside = float(np.mean(squares < chdtri(d, 0.05)))
-    return Row(case, tool, needs, row.error, row.wrong, seconds, float(np.mean(squares)) / d, inside)
+    return with_nees(row, squares, d)
 
 
 def printed(*arguments: str | Path, runs: int = 2) -> tuple[str, float]:
@@ -177,12 +176,6 @@ def printed(*arguments: str | Path, runs: int = 2) -> tuple[str, float]:
     finally:
         core.set_threads(before)
     return out.getvalue(), shortest
-
-
-def folder_of_data() -> Path | None:
-    """Return the folder of recordings: the one that MAGLOC_DATA names, else ``../shared/data``."""
-    folders = (Path(os.environ.get("MAGLOC_DATA", "../shared/data")), REPOSITORY.parent / "shared" / "data")
-    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def table(part: Part, rows: Iterable[Sequence[str]], stated: str) -> str:

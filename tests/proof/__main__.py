@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from tests.conftest import folder_of_data
 from tests.proof import (
     PAGE,
     REPOSITORY,
@@ -19,7 +20,6 @@ from tests.proof import (
     Size,
     better_peers,
     block,
-    folder_of_data,
     merged,
     rows_of,
     table,

@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
-from scipy.special import chdtri
 
 import adcs
 from adcs import quaternion
@@ -20,7 +19,7 @@ from adcs.complementary.orientation_errors import error_angles
 from adcs.io.imu_files import ImuLog
 from arrays.typing import FloatArray
 from tests.bench.inertial import in_axes_of_vqf, madgwick, offline_vqf, ours, vqf_online
-from tests.proof import Part, Row, Size, printed
+from tests.proof import Part, Row, Size, printed, with_nees
 
 WRONG_DEG = 10.0
 MOST_JITTER = 0.01
@@ -56,8 +55,7 @@ def _row(
     row = Row(case, tool, needs, error, float(np.mean(error > WRONG_DEG)), took, rms=rms)
     if not squares:
         return row
-    nees = float(np.mean([np.mean(one) for one in squares]))
-    return replace(row, nees=nees, inside=float(np.mean(np.concatenate(squares) < chdtri(1, 0.05))))
+    return replace(with_nees(row, np.concatenate(squares)), nees=float(np.mean([np.mean(one) for one in squares])))
 
 
 def our_attitudes(case: str, paths: Sequence[Path]) -> Iterator[Row]:

@@ -50,8 +50,8 @@ def _joint_jacobian(array: SensorArray, x: FloatArray) -> FloatArray:
     return np.concatenate([dipole_jacobian(array.positions, sigma, one) for one in x.reshape(-1, 6)], axis=1)
 
 
-def joint_fit(array: SensorArray, values_T: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return places (24, 3) of a joint fit from first places, their covariances, and its cost."""
+def joint_fit(array: SensorArray, values_T: FloatArray, places: FloatArray) -> tuple[FloatArray, float]:
+    """Return places (24, 3) of a joint fit from first places, and its cost."""
     sigma = array.sensors[0].noise_T
     one = np.full((len(array.positions), 1), sigma)
     by_moment = [dipole_jacobian(array.positions, one, np.array([*p, 1.0, 0.0, 0.0]))[:, 3:] for p in places]
@@ -64,9 +64,7 @@ def joint_fit(array: SensorArray, values_T: FloatArray, places: FloatArray) -> t
         x_scale="jac",
         max_nfev=300,
     )
-    covariance = 2.0 * fit.cost / (len(fit.fun) - len(fit.x)) * np.linalg.pinv(fit.jac.T @ fit.jac)
-    blocks = [covariance[6 * k : 6 * k + 3, 6 * k : 6 * k + 3] for k in range(len(places))]
-    return fit.x.reshape(-1, 6)[:, :3], np.array(blocks), float(fit.cost)
+    return fit.x.reshape(-1, 6)[:, :3], float(fit.cost)
 
 
 def _off_wells(found: FloatArray) -> FloatArray:
@@ -102,7 +100,7 @@ def scipy_plate(data: Path, size: Size) -> Iterator[Row]:
     """Joint fits from the wells, and from random places above the plate."""
     array, values = _plate(data)
     began = time.process_time()
-    places, _, _ = joint_fit(array, values, WELL + DEEP)
+    places, _ = joint_fit(array, values, WELL + DEEP)
     needs = "array file, a start for every magnet: its well, 5 mm deep"
     took = time.process_time() - began
     yield judged_places("mean of 100 rows", "scipy, from the wells", needs, took, _off_wells(places), WRONG_WELL_M)
@@ -111,7 +109,7 @@ def scipy_plate(data: Path, size: Size) -> Iterator[Row]:
     began = time.process_time()
     starts = min(MOST_STARTS, size.starts)
     fits = [joint_fit(array, values, rng.uniform(low, high, WELL.shape)) for _ in range(starts)]
-    places = min(fits, key=lambda fit: fit[2])[0]
+    places = min(fits, key=lambda fit: fit[1])[0]
     needs = f"array file, number of magnets, box, {starts} starts"
     took = time.process_time() - began
     yield judged_places("mean of 100 rows", "scipy, random starts", needs, took, _off_wells(places), WRONG_WELL_M)

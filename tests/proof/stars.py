@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import adcs
 from adcs.stars.files import read_star_frames
 from adcs.stars.pictures import read_picture
 from arrays.typing import FloatArray
-from tests.proof import Part, Row, Rows, Size, judged, printed
+from tests.proof import Part, Row, Rows, Size, judged, printed, with_nees
 from tests.proof.star_peers import (
     Centre,
     StarImage,
@@ -64,8 +63,7 @@ def solved(
     known = np.isfinite(sigma) & (error < wrong)
     if not known.any() or case.endswith(WITHOUT_TRUTH):
         return row
-    squares = np.square(error[known] / sigma[known]) / 2.0
-    return replace(row, nees=float(np.mean(squares)), inside=float(np.mean(2.0 * squares < 5.991)))
+    return with_nees(row, np.square(error[known] / sigma[known]), 2)
 
 
 def entries(text: str, key: str, milliseconds: float | None = None) -> list[Centre | None]:
