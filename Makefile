@@ -99,7 +99,7 @@ bench: .venv/installed-bench
 validation: .venv/installed-test
 	$(BIN)/python -m tests.validation $(ONLY)
 
-# Ours and other tools on the same recordings, a quarter of an hour: `make proof ONLY="broad curibio"` for some of them.
+# Ours and other tools on the same recordings, ten minutes: `make proof ONLY="broad curibio"` for some of them.
 proof: .venv/installed-bench
 	$(BIN)/python -m tests.proof $(ONLY)
 

@@ -144,15 +144,20 @@ def threads() -> Iterator[Callable[[int], None]]:
     core.set_threads(before)
 
 
-@pytest.fixture(scope="session")
-def data_folder() -> Path:
-    """Folder of recordings: the one that MAGLOC_DATA names, else ``../shared/data`` beside the repository."""
+def folder_of_data() -> Path | None:
+    """Return the folder of recordings: that of MAGLOC_DATA, else ``../shared/data`` beside the repository; or None."""
     named = os.environ.get("MAGLOC_DATA")
     beside = REPOSITORY.parent / "shared" / "data"
-    for folder in (Path(named) if named else beside, beside):
-        if folder.is_dir():
-            return folder
-    pytest.skip("needs recordings, but neither MAGLOC_DATA nor ../shared/data is a folder")
+    return next((folder for folder in (Path(named) if named else beside, beside) if folder.is_dir()), None)
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """Folder of recordings; a test without it is skipped."""
+    folder = folder_of_data()
+    if folder is None:
+        pytest.skip("needs recordings, but neither MAGLOC_DATA nor ../shared/data is a folder")
+    return folder
 
 
 @pytest.fixture(scope="session")

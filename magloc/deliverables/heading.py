@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from arrays.typing import FloatArray
-from magloc.levels import SIGMA_OF_MAD
+from magloc.measurement.plausibility import robust_sigma
 from magloc.navigation.flight_lines import FlightLine
 
 _ENDS = 0.15  # share of a line at either end that is left out: turns
@@ -60,7 +60,7 @@ def heading_error(xy_m: FloatArray, values_T: FloatArray, lines: Sequence[Flight
     for _ in range(_ROUNDS):
         solve = np.linalg.pinv(columns * np.sqrt(weight)[:, None]) * np.sqrt(weight)
         residual = steps - columns @ (solve @ steps)
-        spread = SIGMA_OF_MAD * float(np.median(np.abs(residual)))
+        spread = robust_sigma(residual)
         weight = np.minimum(1.0, (_OUTLIER * spread + _TINY_T) / (np.abs(residual) + _TINY_T))
     vector = solve @ steps
     dof = max(float(weight.sum()) - columns.shape[1], 1.0)

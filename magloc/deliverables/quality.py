@@ -18,13 +18,12 @@ from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
 from magloc.deliverables.lag import clock_lag, without_ambient
-from magloc.levels import SIGMA_OF_MAD
 from magloc.localization.fit.prior import NOTHING_KNOWN
-from magloc.measurement.plausibility import EARTH_T, finite_median
+from magloc.measurement.plausibility import EARTH_T, finite_median, robust_sigma
 from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
 from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
-from magloc.readings import Readings
+from magloc.readings import Readings, without_saturated
 from magloc.surveying.clock import ClockLag
 from magloc.surveying.fit.sensor_noise import NOISY, white_noise_T
 from magloc.surveying.piece import Ground
@@ -169,7 +168,7 @@ class Quality(Result):
 
     def noise_in(self, rows: slice | IntArray) -> FloatArray:
         """Return the noise of each sensor (N,) in some rows."""
-        return np.array([_spread(column) for column in self.fourth_T[rows].T])
+        return np.array([robust_sigma(column) for column in self.fourth_T[rows].T])
 
     @cached_property
     def checks(self) -> tuple[Check, ...]:
@@ -336,8 +335,9 @@ def check_quality(
     assert place_m is not None
     terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
     ground = Ground(NOTHING_KNOWN, terrain, _SHORTEST_GEOLOGY_M, math.inf)
+    read_T, rows = field_moduli(array, rows.values_T), without_saturated(rows, array)
     stuck, spikes, unusable = unusable_readings(array, rows, ground.shallowest_m, terrain)
-    moduli_T = np.where(unusable, np.nan, field_moduli(array, rows.values_T))
+    moduli_T = np.where(unusable, np.nan, read_T)
     height_m = -terrain.depth_of(place_m)
     lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
     coverage = _coverage(place_m[:, :2], lines)
@@ -356,7 +356,8 @@ def check_quality(
         [heading_error(place_m[:, :2], column, lines) for column in without_ambient(rows, moduli_T).T],
         None if coverage is None else clock_lag(array, whole, ground, coverage.spacing_m),
         coverage,
-        np.array([finite_median(column) for column in moduli_T.T]),
+        # Saturated readings count here: they show a wrong unit.
+        np.array([finite_median(column) for column in np.where(stuck | spikes, np.nan, read_T).T]),
         held,
         _level_share(rows),
     )
@@ -378,11 +379,6 @@ def _fourth_differences(time_s: FloatArray, values: FloatArray) -> FloatArray:
     beside = np.convolve(is_gap, np.ones(4), mode="valid") > 0.0
     out[2:-2][beside] = np.nan
     return out
-
-
-def _spread(values: FloatArray) -> float:
-    """Return the standard deviation of Gaussian values with outliers; NaN without any value."""
-    return SIGMA_OF_MAD * finite_median(np.abs(values))
 
 
 def _level_share(rows: Readings) -> float:

@@ -60,12 +60,15 @@ def read_bag(path: Path) -> Log:
 
 
 def _topics(reader: AnyReader, path: str, warnings: list[str]) -> Iterator[Topic]:
+    publishers: dict[tuple[str, str], list[Any]] = {}  # a driver that starts again is another one
     for connection in reader.connections:
+        publishers.setdefault((connection.topic, connection.msgtype), []).append(connection)
+    for (topic, kind), connections in publishers.items():
         times = array("d")
         columns: dict[str, array[float]] = {}
         try:
-            for _, stamp_ns, raw in reader.messages([connection]):
-                message = reader.deserialize(raw, connection.msgtype)
+            for _, stamp_ns, raw in reader.messages(connections):
+                message = reader.deserialize(raw, kind)
                 found = dict(_numbers(message, ""))
                 if not columns:
                     columns = {name: array("d") for name in found}
@@ -75,11 +78,11 @@ def _topics(reader: AnyReader, path: str, warnings: list[str]) -> Iterator[Topic
                 for name, value in found.items():
                     columns[name].append(value)
         except Exception:  # the end of a cut bag
-            warnings.append(f"{path}: parts of {connection.topic} are damaged or cut; the whole messages are read")
+            warnings.append(f"{path}: parts of {topic} are damaged or cut; the whole messages are read")
         if times:
             fields = {name: np.array(of) for name, of in columns.items()}
-            units = {name: unit for name in fields if (unit := _unit(connection.msgtype, name)) is not None}
-            yield Topic(connection.topic, np.array(times), fields, units, "unix")
+            units = {name: unit for name in fields if (unit := _unit(kind, name)) is not None}
+            yield Topic(topic, np.array(times), fields, units, "unix")
 
 
 def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:

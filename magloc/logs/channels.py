@@ -175,14 +175,18 @@ class Log(Mapping[str, LogChannel]):
         time_s = channels[0].time_s
         if any(not np.array_equal(each.time_s, time_s) for each in channels[1:]):
             raise InputError(f"{self.path}: found other times in {', '.join(names)}, expected channels of one message.")
-        step_s = np.diff(time_s)
-        back = np.flatnonzero(~(step_s >= 0.0))
+        self.check_clock(channels[0])
+        is_new = np.concatenate([[True], np.diff(time_s) > 0.0])[: len(time_s)]
+        return time_s[is_new], np.stack([each.values for each in channels], axis=1)[is_new]
+
+    def check_clock(self, channel: LogChannel) -> None:
+        """Refuse a channel whose times do not ascend."""
+        time_s = channel.time_s
+        back = np.flatnonzero(~(np.diff(time_s) >= 0.0))
         if len(back):
             row = int(back[0])
-            found = f"found {time_s[row + 1]:.6f} s after {time_s[row]:.6f} s in row {row + 2} of {names[0]}"
+            found = f"found {time_s[row + 1]:.6f} s after {time_s[row]:.6f} s in row {row + 2} of {channel.name}"
             raise InputError(f"{self.path}: {found}, expected a clock that advances: cut the log there.")
-        is_new = np.concatenate([[True], step_s > 0.0])[: len(time_s)]
-        return time_s[is_new], np.stack([each.values for each in channels], axis=1)[is_new]
 
     def lines(self, most: int | None = None) -> list[str]:
         """Return the lines of a table of at most `most` channels."""

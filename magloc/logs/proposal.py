@@ -11,7 +11,7 @@ import numpy as np
 from arrays.columns import NANOTESLA
 from arrays.logs.proposal import Proposal
 from magloc.logs.channels import Log, Topic
-from magloc.logs.sensors import axes_of, magnetometer_names
+from magloc.logs.sensors import axes_of, magnetometer_names, readings_vary
 
 _ANGLES = (
     [f"vehicle_attitude.{name}_deg" for name in ("yaw", "pitch", "roll")],
@@ -46,7 +46,9 @@ def propose_log_columns(log: Log) -> Proposal:
     about = f"{log.kind}. Channels, by the messages that share their times:"
     channels: dict[str, str] = {}
     for topic in log.topics:
-        channels[f"{topic.name} (own clock)" if topic.name in channels else topic.name or "table"] = _described(topic)
+        is_inside = topic.name in channels  # a sensor of the same message with a clock of its own
+        name = f"{topic.name} (own clock of {next(iter(topic.fields))})" if is_inside else topic.name or "table"
+        channels[name] = _described(topic)
     lines = (_FRONT_RIGHT_DOWN,) if is_autopilot else ()
     return Proposal(channels, keys, {key: tuple(names) for key, names in sensors.items()}, asked, 0, about, lines)
 
@@ -60,7 +62,7 @@ def _sensors(log: Log, asked: list[str]) -> dict[str, tuple[str, ...]]:
             axes_of(name) for name in fields if name.endswith(("x", "X", "[0]")) and set(axes_of(name)) <= set(fields)
         ]
         known = known or [(name,) for name in fields]  # type: ignore[misc]
-    working = [names for names in known if any(np.ptp(log[name].values) > 0.0 for name in names if len(log[name]))]
+    working = [names for names in known if any(readings_vary(log[name].values[:, None]) for name in names)]
     asked += [f"{names[0]} stands still: it is left out" for names in known if names not in working]
     return {f"s{k}": names for k, names in enumerate(working, start=1)}
 

@@ -17,6 +17,7 @@ from arrays.io.errors import InputError, of_extra
 from arrays.io.text import read_bytes
 from arrays.typing import FloatArray
 from magloc.logs.channels import Log, Topic
+from magloc.logs.sensors import are_attitudes
 from magloc.logs.units import PLACE, PLACE_E7, LoggedUnit, logged_unit, unit_of_field
 
 _NO_TIME = 0x7FFFFFFF  # relative time of a sensor without a sample
@@ -89,6 +90,7 @@ def _topics(message: Any) -> Iterator[Topic]:
     units = {field: _unit(str(message.name), field) for field in fields}
     units = {field: unit for field, unit in units.items() if unit.logged}
     whole = Topic(name, _seconds(time_us), fields, units, "boot")
+    inside = []
     for sensor in ("accelerometer", "magnetometer"):
         later = columns.get(f"{sensor}_timestamp_relative")
         own = {field: of for field, of in fields.items() if field.startswith(f"{sensor}_") and "timestamp" not in field}
@@ -96,14 +98,19 @@ def _topics(message: Any) -> Iterator[Topic]:
             continue
         own_us = time_us + later
         is_new = (later != _NO_TIME) & (np.diff(own_us, prepend=-1) != 0)  # a sample stands until the next
-        yield replace(whole, time_s=_seconds(own_us[is_new]), fields={field: of[is_new] for field, of in own.items()})
+        values = {field: of[is_new] for field, of in own.items()}
+        inside.append(replace(whole, time_s=_seconds(own_us[is_new]), fields=values))
         fields = {field: of for field, of in fields.items() if field not in own}
-    yield replace(whole, fields=fields)
+    yield from (replace(whole, fields=fields), *inside)
 
 
 def _angles_deg(fields: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return yaw, pitch and roll (n,) [deg] of the quaternion, from north, east, down to forward, right, down."""
-    w, x, y, z = (fields[f"q[{i}]"].astype(np.float64) for i in range(4))
+    """Return yaw, pitch and roll (n,) [deg] of the quaternion, from north, east, down to forward, right, down.
+
+    They are NaN where the quaternion has not the length 1: the estimator has no attitude yet.
+    """
+    q = np.stack([fields[f"q[{i}]"].astype(np.float64) for i in range(4)], axis=1)
+    w, x, y, z = np.where(are_attitudes(q)[:, None], q, np.nan).T
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))

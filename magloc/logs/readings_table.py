@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 
@@ -24,21 +26,20 @@ _UNIT_RTOL = 1e-6
 
 def table_of_file(path: str | PathLike[str], form: LogFormat) -> Table:
     """Return the table of a readings file, of a log in text, or of a binary log."""
-    logged = binary_table(path, form)
-    if logged is not None:
-        return form.translate(logged)
-    return form.table(read_text(path, "a CSV file", form.encoding), str(path))
+    if log_reader(path) is None:
+        return form.table(read_text(path, "a CSV file", form.encoding), str(path))
+    logged, n_left_out = _table_of_log(read_log(path), form)
+    if n_left_out:
+        _LOG.warning(f"{path}: {n_left_out} rows are outside the attitude or in its gaps, and are left out")
+    return form.translate(logged)
 
 
-def binary_table(path: str | PathLike[str], form: LogFormat) -> Table | None:
-    """Return the columns of a binary log that a format names, in the units of the log; None for text.
+def _table_of_log(log: Log, form: LogFormat) -> tuple[Table, int]:
+    """Return the columns of a log that a format names, in the units of the log, and the number of rows left out.
 
     The rows are those of the first sensor, as far as there is an attitude, if one is named. Other channels are
     interpolated to its times; they are missing in gaps.
     """
-    if log_reader(path) is None:
-        return None
-    log = read_log(path)
     if form.columns is None:  # a table with the columns of a readings file
         names = list(log.topics[0].channel_names())
         sensors = [name for of in form.channels.values() for name in of]
@@ -51,29 +52,31 @@ def binary_table(path: str | PathLike[str], form: LogFormat) -> Table | None:
         names = list(dict.fromkeys(name for name in wanted if name != "time_s" or name in log))
         names += [name for name in form.others if name in log and name not in names]
     time_s = log.require((sensors or names)[0]).time_s
-    values = {name: _in_rows(time_s, log.require(name), form.columns) for name in names}
+    values = {name: _in_rows(time_s, log, log.require(name), form.columns) for name in names}
     if "time_s" not in values:
         values = {"time_s": time_s, **values}
     table = np.stack(list(values.values()), axis=1)
     attitude = [list(values).index(name) for name in (form.columns.attitude if form.columns is not None else ())]
     is_known = np.isfinite(table[:, attitude]).all(axis=1)
-    if not is_known.all():
-        _LOG.warning(f"{path}: {(~is_known).sum()} rows are outside the attitude or in its gaps, and are left out")
-    return Table(str(path), tuple(values), 1, table[is_known], 1 + np.flatnonzero(is_known))
+    rows = np.flatnonzero(is_known)
+    return Table(log.path, tuple(values), 1, table[rows], 1 + rows), len(table) - len(rows)
 
 
 def origin_of_log(path: str | PathLike[str], columns: LogColumns) -> Vector:
     """Return latitude, longitude [deg] and height [m] of the first position of a log, also of a binary one."""
-    if columns.track is not None:
+    reader = log_reader(path)
+    if columns.track is not None or reader is None:
         return log_origin(path, columns)
-    return log_origin(path, columns, binary_table(path, LogFormat({}, columns, "", ())))
+    form = LogFormat({}, replace(columns, quaternion=None, angles=None), "", ())
+    return log_origin(path, columns, _table_of_log(reader(Path(path)), form)[0])
 
 
 def date_of_log(path: str | PathLike[str], columns: LogColumns) -> str | None:
     """Return the date of the begin of a log, such as 2026-05-12; None if it states none."""
-    if log_reader(path) is None:
+    reader = log_reader(path)
+    if reader is None:
         return log_date(path, columns)
-    log = read_log(path)
+    log = reader(Path(path))
     return None if log.unix_zero_s is None else date_of(log.unix_zero_s + float(log.topics[0].time_s[:1].sum()))
 
 
@@ -89,21 +92,23 @@ def _check_units(log: Log, names: list[str], columns: LogColumns) -> None:
             )
 
 
-def _in_rows(time_s: FloatArray, channel: LogChannel, columns: LogColumns | None) -> FloatArray:
+def _in_rows(time_s: FloatArray, log: Log, channel: LogChannel, columns: LogColumns | None) -> FloatArray:
     """Return the numbers of a channel at times (n,): m and degrees, other quantities in their unit in the log."""
     values = channel.values if channel.unit in ("deg", "m") else channel.values / channel.si_per_unit
     if channel.unit == "rad":
         values = np.degrees(channel.values)
     if np.array_equal(channel.time_s, time_s):
         return values
-    if not len(values) or (np.diff(channel.time_s) < 0.0).any():
-        found = "no value" if not len(values) else "a clock that goes back"
-        raise InputError(f"{channel.name}: found {found}, expected values at ascending times.")
+    if not len(values):
+        raise InputError(f"{log.path}: found no value of {channel.name}, expected some.")
+    log.check_clock(channel)
     flags = () if columns is None else [of.column for of in (columns.valid, columns.fix) if of is not None]
     if channel.name in flags or (columns is not None and channel.name in (columns.quaternion or ())):
         after = np.clip(np.searchsorted(channel.time_s, time_s), 1, max(len(values) - 1, 1))
         is_before = time_s - channel.time_s[after - 1] < channel.time_s[np.minimum(after, len(values) - 1)] - time_s
         return np.asarray(values[np.minimum(after, len(values) - 1) - (is_before & (len(values) > 1))])
+    sample_s = channel.time_s
     if columns is not None and channel.name in (columns.angles or ()):
-        values = np.unwrap(values, period=360.0)
-    return resample(time_s, channel.time_s, values[:, None])[:, 0]
+        known = np.isfinite(values)  # a missing angle would make all later ones missing
+        sample_s, values = sample_s[known], np.unwrap(values[known], period=360.0)
+    return resample(time_s, sample_s, values[:, None])[:, 0]

@@ -12,7 +12,7 @@ import numpy as np
 from arrays.io.errors import naming
 from arrays.typing import FloatArray
 from magloc.logs.channels import Log
-from magloc.logs.sensors import VectorReadings, find_sensors
+from magloc.logs.sensors import VectorReadings, find_sensors, readings_vary
 from magloc.logs.time_base import GAP_STEPS
 
 _FEWEST_ROWS = 200
@@ -81,7 +81,7 @@ def rest_noise(readings: VectorReadings, unit: str) -> RestNoise:
     Raises
     ------
     ValueError
-        There are too few readings without a gap.
+        There are too few readings without a gap, or all are equal.
     """
     step_s = np.diff(readings.time_s)
     usual_s = float(np.median(step_s)) if len(step_s) else 0.0
@@ -93,6 +93,11 @@ def rest_noise(readings: VectorReadings, unit: str) -> RestNoise:
     if len(values) < _FEWEST_ROWS:
         expected = f"{_FEWEST_ROWS} readings or more without a gap, at rest"
         raise ValueError(f"Input {readings.name} must have {expected}; instead received {len(values)}.")
+    if not readings_vary(values):
+        expected = "readings that vary at rest: their steps must be finer than the noise"
+        raise ValueError(
+            f"Input {readings.name} must have {expected}; instead received {values[0].tolist()} in all rows."
+        )
     tau_s, deviation = allan_deviation(values, 1.0 / usual_s)
     variance = np.mean(deviation**2, axis=1)
     freedoms = 1.5 * values.size * usual_s / tau_s

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from arrays.io.errors import InputError
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.logs.channels import Log
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _XYZ = ("x", "y", "z")
 _LEAST_RATE_Hz = 10.0  # slower topics are for supervision
+_UNIT_WITHIN = 0.1  # largest error of the length of a quaternion
 _GYROS = (
     r"sensor_combined\.gyro_rad\[0\]",
     r"vehicle_imu(\[\d+\])?\.delta_angle\[0\]",
@@ -94,7 +95,7 @@ def find_sensors(log: Log) -> LogSensors:
     """
     gyro, accelerometer = _inertial(log, "gyro", _GYROS), _inertial(log, "accelerometer", _ACCELEROMETERS)
     found = list(_candidates(log, _MAGNETOMETERS))
-    working = [sensor for sensor in found if np.ptp(sensor.values, axis=0).any()]
+    working = [sensor for sensor in found if readings_vary(sensor.values)]
     warnings = [
         f"{log.path}: the magnetometer {sensor.name} stands at {sensor.values[0].tolist()} T and is left out"
         for sensor in found
@@ -117,7 +118,7 @@ def _inertial(log: Log, kind: str, patterns: Sequence[str]) -> VectorReadings:
         raise InputError(f"{log.path}: found no {kind}, expected {expected}.")
     fast = (each for each in found if log[each.name].rate_Hz >= _LEAST_RATE_Hz)
     chosen = next(fast, max(found, key=lambda each: len(each.time_s)))
-    if not np.ptp(chosen.values, axis=0).any():
+    if not readings_vary(chosen.values):
         values = chosen.values[0].tolist()
         raise InputError(f"{log.path}: found a {kind} {chosen.name} that stands at {values}, expected one that works.")
     return chosen
@@ -141,6 +142,12 @@ def _candidates(log: Log, patterns: Sequence[str]) -> Iterator[VectorReadings]:
             yield VectorReadings(name, time_s, values)
 
 
+def readings_vary(values: FloatArray) -> bool:
+    """Return whether the complete rows of readings (n, k) differ; those of a dead sensor are equal or missing."""
+    known = values[np.isfinite(values).all(axis=1)]
+    return len(known) > 0 and bool(np.ptp(known, axis=0).any())
+
+
 def axes_of(name: str) -> tuple[str, str, str]:
     """Return the channels of the three axes by that of the first."""
     if name.endswith("[0]"):
@@ -149,6 +156,11 @@ def axes_of(name: str) -> tuple[str, str, str]:
     stem, last = name[:-1], name[-1]
     x, y, z = _XYZ if last == "x" else ("X", "Y", "Z")
     return stem + x, stem + y, stem + z
+
+
+def are_attitudes(quaternions: FloatArray) -> BoolArray:
+    """Return the rows (n,) of quaternions (n, 4) whose length is 1 to a tenth."""
+    return np.asarray(np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) < _UNIT_WITHIN)
 
 
 def _own_attitude(log: Log) -> tuple[FloatArray, Rotation] | None:
@@ -161,7 +173,7 @@ def _own_attitude(log: Log) -> tuple[FloatArray, Rotation] | None:
     angles = [f"ATT.{name}" for name in ("Yaw", "Pitch", "Roll")]
     if set(quaternions) <= set(log):
         time_s, values = log.vectors(quaternions)
-        is_whole = np.isfinite(values).all(axis=1) & (np.abs(np.linalg.norm(values, axis=1) - 1.0) < 0.1)
+        is_whole = are_attitudes(values)
         return (time_s[is_whole], enu_from_ned * Rotation.from_quat(values[is_whole])) if is_whole.any() else None
     if set(angles) <= set(log):
         time_s, values = log.vectors(angles)

@@ -17,6 +17,7 @@ from arrays.array import SensorArray
 from arrays.io.world_maps import FARTHEST_M
 from arrays.typing import FloatArray
 from magloc.ambient import in_world_field
+from magloc.levels import SIGMA_OF_MAD
 from magloc.measurement.rows import ambient_fields
 from magloc.readings import Readings, as_readings, without_saturated
 
@@ -359,3 +360,8 @@ def finite_median(values: FloatArray) -> float:
     """Return the median of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")
+
+
+def robust_sigma(residuals: FloatArray) -> float:
+    """Return σ of Gaussian residuals with outliers, by their median modulus; NaN without any."""
+    return SIGMA_OF_MAD * finite_median(np.abs(residuals))

@@ -193,7 +193,7 @@ def rows_without_attitude(array: SensorArray, readings: Readings) -> BoolArray:
     if not none.size - turning.sum() >= FEWEST_ROWS:
         return none
     if turning.any():
-        _LOG.warning(f"{turning.sum()} rows of turns, whose attitude the course does not tell, are left out")
+        _LOG.warning(f"{turning.sum()} rows of turns are left out, because the course is not the attitude there")
     return turning
 
 

@@ -13,8 +13,8 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.points import field_at_points
 from magloc.grids.work import Arrays, Each, Work
-from magloc.levels import SIGMA_OF_MAD
 from magloc.localization.fit.prior import SourcePrior
+from magloc.measurement.plausibility import robust_sigma
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag, SmoothTrack, Trial, estimate_lag, fit_at_lag
 from magloc.surveying.error_components import with_likeliest_offsets, with_likeliest_pose
@@ -79,7 +79,7 @@ class TiledSurvey:
         sample = record_of(array, readings[:: -(-len(readings) // _SAMPLE)], ground.terrain)[0]
         bounds = ground.bounds(sample)
         offset = np.median(sample.values_T, axis=0)
-        spread = SIGMA_OF_MAD * float(np.median(np.abs(sample.values_T - offset)))
+        spread = robust_sigma(sample.values_T - offset)
         reach = sample.height_m - float(bounds.low_m[2])
         assert readings.array_position_m is not None
         tiles, margin_m = tiles_of(readings.array_position_m[:, :2], reach)

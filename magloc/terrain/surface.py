@@ -44,6 +44,11 @@ class Terrain:
     sigma_m : float
         Standard deviation of the heights below the sensors; intervals of depths count it.
 
+    Raises
+    ------
+    ValueError
+        ``sigma_m`` is negative or not finite.
+
     Examples
     --------
     >>> import magloc
@@ -58,6 +63,10 @@ class Terrain:
     cell_m: float = 1.0
     name: str = ""
     sigma_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.sigma_m < math.inf:
+            raise ValueError(f"Input sigma_m must be zero or a positive number; instead received {self.sigma_m}.")
 
     @classmethod
     def from_points(cls, place_m: FloatArray, name: str = "") -> Terrain:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import io
-import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,9 +66,9 @@ class Row:
         return (
             self.case,
             self.tool,
-            *map(written, (rms, *quantiles)),
+            *map(number_text, (rms, *quantiles)),
             f"{100.0 * self.wrong:.1f} %",
-            NOTHING if self.nees is None else written(self.nees),
+            NOTHING if self.nees is None else number_text(self.nees),
             NOTHING if self.inside is None else f"{100.0 * self.inside:.0f} %",
             duration(self.seconds),
             self.needs,
@@ -90,7 +89,7 @@ class Part:
     peers: Mapping[str, Rows]
 
 
-def written(value: float) -> str:
+def number_text(value: float) -> str:
     """Return a number with three significant digits, or none where there is no answer."""
     if not np.isfinite(value):
         return "none"
@@ -105,7 +104,7 @@ def duration(seconds: float) -> str:
     if not np.isfinite(seconds):
         return NOTHING
     unit, factor = next((u, f) for u, f in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)) if seconds * f >= 1.0 or u == "µs")
-    return f"{written(seconds * factor)} {unit}"
+    return f"{number_text(seconds * factor)} {unit}"
 
 
 def value_of(cell: str) -> float | None:
@@ -116,22 +115,23 @@ def value_of(cell: str) -> float | None:
     return float(found[0].replace(",", "")) if found else None
 
 
-def judged(
+def row_of_errors(
     case: str, tool: str, needs: str, seconds: float, error: FloatArray, wrong: float, sigma: FloatArray | None = None
 ) -> Row:
     """Return the row of errors (n,), of which those beyond a limit are wrong, with their claimed σ (n,) if any."""
     error = np.where(np.isfinite(error), np.abs(error), np.inf)
     share = float(np.mean(error > wrong))
-    if sigma is None:
-        return Row(case, tool, needs, error, share, seconds)
+    row = Row(case, tool, needs, error, share, seconds)
     known = np.isfinite(error)
-    squares = np.square(error[known] / sigma[known])
-    return Row(
-        case, tool, needs, error, share, seconds, float(np.mean(squares)), float(np.mean(squares < chdtri(1, 0.05)))
-    )
+    return row if sigma is None else with_nees(row, np.square(error[known] / sigma[known]))
 
 
-def judged_places(
+def with_nees(row: Row, squares: FloatArray, d: int = 1) -> Row:
+    """Return a row with the consistency of its squared errors (n,) over their covariance of d dimensions."""
+    return replace(row, nees=float(np.mean(squares)) / d, inside=float(np.mean(squares < chdtri(d, 0.05))))
+
+
+def row_of_offsets(
     case: str,
     tool: str,
     needs: str,
@@ -143,17 +143,16 @@ def judged_places(
     scale: float = 1e3,
 ) -> Row:
     """Return the row of offsets (n, d) with their covariance (n, d, d), to which the truth's own error is added."""
-    row = judged(case, tool, needs, seconds, scale * np.linalg.norm(off, axis=1), scale * wrong)
+    row = row_of_errors(case, tool, needs, seconds, scale * np.linalg.norm(off, axis=1), scale * wrong)
     if covariance is None:
         return row
     known, d = np.isfinite(off).all(axis=1), off.shape[1]
     both = covariance[known] + truth_sigma**2 * np.eye(d)
     squares = np.vecdot(off[known], np.linalg.solve(both, off[known][..., None])[..., 0])
-    inside = float(np.mean(squares < chdtri(d, 0.05)))
-    return Row(case, tool, needs, row.error, row.wrong, seconds, float(np.mean(squares)) / d, inside)
+    return with_nees(row, squares, d)
 
 
-def printed(*arguments: str | Path, runs: int = 2) -> tuple[str, float]:
+def run_command(*arguments: str | Path, runs: int = 2) -> tuple[str, float]:
     """Return what a command line prints and its processor time with one thread, the shorter of two short runs.
 
     It runs in this process. The time has no import; it has the files that are read and the text that is printed.
@@ -177,12 +176,6 @@ def printed(*arguments: str | Path, runs: int = 2) -> tuple[str, float]:
     finally:
         core.set_threads(before)
     return out.getvalue(), shortest
-
-
-def folder_of_data() -> Path | None:
-    """Return the folder of recordings: the one that MAGLOC_DATA names, else ``../shared/data``."""
-    folders = (Path(os.environ.get("MAGLOC_DATA", "../shared/data")), REPOSITORY.parent / "shared" / "data")
-    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def table(part: Part, rows: Iterable[Sequence[str]], stated: str) -> str:
@@ -217,7 +210,7 @@ def with_block(page: str, name: str, text: str) -> str:
     return page.replace(f"{mark}{block(page, name)}{END}", f"{mark}\n\n{text}\n\n{END}")
 
 
-def merged(fresh: Sequence[Sequence[str]], stored: Sequence[Sequence[str]]) -> list[list[str]]:
+def merge_rows(fresh: Sequence[Sequence[str]], stored: Sequence[Sequence[str]]) -> list[list[str]]:
     """Return the fresh rows, each case with the stored rows of tools that were not run."""
     cases = list(dict.fromkeys(row[0] for row in [*fresh, *stored]))
     done = {tuple(row[:2]) for row in fresh}

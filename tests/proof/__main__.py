@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from tests.conftest import folder_of_data
 from tests.proof import (
     PAGE,
     REPOSITORY,
@@ -19,8 +20,7 @@ from tests.proof import (
     Size,
     better_peers,
     block,
-    folder_of_data,
-    merged,
+    merge_rows,
     rows_of,
     table,
     table_lines,
@@ -34,20 +34,20 @@ DISTRIBUTIONS = {"tetra3": "cedar-solve"}
 """Packages whose name on PyPI is another."""
 
 
-def told(text: str, end: str = "\n") -> None:
+def report(text: str, end: str = "\n") -> None:
     print(text, end=end, file=sys.stderr, flush=True)
 
 
 def rows(name: str, of_tool: Rows, data: Path, size: Size) -> Iterator[Row]:
     """Rows of one tool; none, with a message, where it is not installed."""
     began = time.perf_counter()
-    told(f"  {name} ...", end="")
+    report(f"  {name} ...", end="")
     try:
         yield from of_tool(data, size)
     except ModuleNotFoundError as error:
-        told(f" skipped: {error.name} is not installed")
+        report(f" skipped: {error.name} is not installed")
     else:
-        told(f" {time.perf_counter() - began:.0f} s")
+        report(f" {time.perf_counter() - began:.0f} s")
 
 
 def versions(part: Part) -> str:
@@ -67,7 +67,7 @@ def run(page: str, part: Part, data: Path, size: Size, *, peers: bool) -> str:
     tools = {"ours": part.ours} | (dict(part.peers) if peers else {})
     fresh = [list(row.cells) for name, of_tool in tools.items() for row in rows(name, of_tool, data, size)]
     stated = f"Wrong: {part.wrong}. Measured {datetime.date.today()}: `make proof ONLY={part.name}`; {versions(part)}."
-    return with_block(page, part.name, table(part, merged(fresh, rows_of(block(page, part.name))), stated))
+    return with_block(page, part.name, table(part, merge_rows(fresh, rows_of(block(page, part.name))), stated))
 
 
 def with_summary(page: str) -> str:
@@ -93,14 +93,14 @@ def main() -> int:
         )
     data, page = folder_of_data(), given.page.read_text(encoding="utf-8")
     if data is None:
-        told("skipped: neither MAGLOC_DATA nor ../shared/data is a folder")
+        report("skipped: neither MAGLOC_DATA nor ../shared/data is a folder")
         return 0
     for part in PARTS:
         if given.part and part.name not in given.part:
             continue
-        told(part.name)
+        report(part.name)
         if not (data / part.name).is_dir():
-            told(f"  skipped: {data / part.name} is not there")
+            report(f"  skipped: {data / part.name} is not there")
             continue
         page = run(page, part, data, QUICK if given.quick else Size(), peers=not given.ours)
         print(block(page, part.name).strip(), flush=True)
@@ -116,5 +116,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except KeyboardInterrupt:
-        told("\nstopped; the page has the parts that were done")
+        report("\nstopped; the page has the parts that were done")
         sys.exit(130)

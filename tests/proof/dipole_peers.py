@@ -16,8 +16,6 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 
-MU0_OVER_4PI = 1e-7
-
 
 @dataclass(frozen=True, eq=False)
 class Fits:
@@ -43,13 +41,7 @@ def dipole_residual(places: FloatArray, field: FloatArray, sigma: FloatArray, x:
 
 def dipole_jacobian(places: FloatArray, sigma: FloatArray, x: FloatArray) -> FloatArray:
     """Return their derivative by the state."""
-    r = places - x[:3]
-    d2 = np.sum(r * r, axis=1)[:, None, None]
-    outer, along = r[:, :, None] * r[:, None, :], (r @ x[3:])[:, None, None]
-    by_moment = MU0_OVER_4PI * (3.0 * outer / d2 - np.eye(3)) / d2**1.5
-    mixed = r[:, :, None] * x[3:] + x[3:, None] * r[:, None, :] + along * np.eye(3)
-    by_place = -3.0 * MU0_OVER_4PI * (mixed - 5.0 * along * outer / d2) / d2**2.5
-    return (np.concatenate([by_place, by_moment], axis=2) / sigma[..., None]).reshape(-1, 6)
+    return (dipole.field_jacobian(places, x[:3], x[3:]) / sigma[..., None]).reshape(-1, 6)
 
 
 def as_fits(found: list[OptimizeResult], began: float) -> Fits:

@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
-from scipy.special import chdtri
 
 import adcs
 from adcs import quaternion
@@ -20,7 +19,7 @@ from adcs.complementary.orientation_errors import error_angles
 from adcs.io.imu_files import ImuLog
 from arrays.typing import FloatArray
 from tests.bench.inertial import in_axes_of_vqf, madgwick, offline_vqf, ours, vqf_online
-from tests.proof import Part, Row, Size, printed
+from tests.proof import Part, Row, Size, run_command, with_nees
 
 WRONG_DEG = 10.0
 MOST_JITTER = 0.01
@@ -30,7 +29,7 @@ FROM_NORTH = quaternion.exp([0.0, 0.0, 0.5 * np.pi])
 Attitude = Callable[[InertialMagneticRecord], FloatArray]
 
 
-def heading_fitted(q: FloatArray, log: ImuLog) -> FloatArray:
+def fit_heading(q: FloatArray, log: ImuLog) -> FloatArray:
     """Return attitudes turned about the vertical by the constant that fits the truth best."""
     assert log.q_true is not None
     known = log.moving & np.isfinite(log.q_true).all(axis=1)
@@ -56,8 +55,7 @@ def _row(
     row = Row(case, tool, needs, error, float(np.mean(error > WRONG_DEG)), took, rms=rms)
     if not squares:
         return row
-    nees = float(np.mean([np.mean(one) for one in squares]))
-    return replace(row, nees=nees, inside=float(np.mean(np.concatenate(squares) < chdtri(1, 0.05))))
+    return replace(with_nees(row, np.concatenate(squares)), nees=float(np.mean([np.mean(one) for one in squares])))
 
 
 def our_attitudes(case: str, paths: Sequence[Path]) -> Iterator[Row]:
@@ -67,7 +65,7 @@ def our_attitudes(case: str, paths: Sequence[Path]) -> Iterator[Row]:
         for path in paths:
             log = adcs.read_imu(path)
             with TemporaryDirectory() as folder:
-                printed("adcs", "imu", path, "--out", folder, "--json", *(["--offline"] if offline else []), runs=1)
+                run_command("adcs", "imu", path, "--out", folder, "--json", *(["--offline"] if offline else []), runs=1)
                 table = pd.read_csv(Path(folder) / "attitude.csv")
             total, heading = errors_deg(table[["qw", "qx", "qy", "qz"]].to_numpy(), log)
             assert log.q_true is not None
@@ -106,7 +104,7 @@ def peer_attitudes(
         began = time.process_time()
         q = on_even_times(log.record, solve)
         took += time.process_time() - began
-        errors.append(errors_deg(heading_fitted(q, log) if fitted else q, log)[0])
+        errors.append(errors_deg(fit_heading(q, log) if fitted else q, log)[0])
     yield _row(case, tool, needs + (", true constant of heading" if fitted else ""), took / len(paths), errors)
 
 

@@ -17,7 +17,7 @@ from arrays.sensor import Sensor
 from arrays.typing import FloatArray
 from magloc.readings import read_readings
 from magloc.truth import Truth, read_truth
-from tests.proof import Part, Row, Size, judged_places, printed
+from tests.proof import Part, Row, Size, row_of_offsets, run_command
 from tests.proof.dipole_peers import Fits, cylinders, kalman_track, linear_calibration, random_starts
 
 WRONG_M = 5e-3
@@ -37,7 +37,7 @@ class Located(NamedTuple):
     covariance: FloatArray
 
 
-def located(text: str) -> Located:
+def best_solutions(text: str) -> Located:
     """Return the best solution of every row that ``magloc locate --json`` or ``magloc track --json`` prints."""
     places, covariances = [], []
     for entry in json.loads(text)["results"]:
@@ -48,7 +48,7 @@ def located(text: str) -> Located:
     return Located(np.array(places), np.array(covariances))
 
 
-def stated(folder: Path, array: Path, first: str) -> Path:
+def prepend_lines(folder: Path, array: Path, first: str) -> Path:
     """Write an array file with first lines of its own into a folder."""
     folder.mkdir(exist_ok=True)
     path = folder / array.name
@@ -63,7 +63,7 @@ def _mocap_row(
     run: int, tool: str, needs: str, seconds: float, places: FloatArray, covariance: FloatArray, truth: Truth
 ) -> Row:
     off = places - truth.position_m
-    return judged_places(f"run {run}", tool, needs, seconds, off, WRONG_M, covariance, MOCAP_SIGMA_M)
+    return row_of_offsets(f"run {run}", tool, needs, seconds, off, WRONG_M, covariance, MOCAP_SIGMA_M)
 
 
 def our_mocap(data: Path, _: Size) -> Iterator[Row]:
@@ -72,7 +72,7 @@ def our_mocap(data: Path, _: Size) -> Iterator[Row]:
     with TemporaryDirectory() as name:
         for run in RUNS:
             readings, truth = folder / f"run{run}.csv", read_truth(folder / f"run{run}-truth.csv")
-            array = stated(Path(name), folder / f"array-run{run}.toml", SUBTRACTED)
+            array = prepend_lines(Path(name), folder / f"array-run{run}.toml", SUBTRACTED)
             noisy = Path(name) / "noisy.toml"
             text = array.read_text(encoding="utf-8")
             noisy.write_text(text.replace("noise_fraction = 0.003", "noise_fraction = 0.01"), encoding="utf-8")
@@ -81,18 +81,18 @@ def our_mocap(data: Path, _: Size) -> Iterator[Row]:
                 ("track", array, "array file"),
                 ("track", noisy, "array file with noise_fraction = 0.01"),
             ):
-                text, seconds = printed("magloc", label, readings, "--array", path, "--json")
+                text, seconds = run_command("magloc", label, readings, "--array", path, "--json")
                 tool = f"`magloc {label}`" + (", noise stated" if path == noisy else "")
-                yield _mocap_row(run, tool, needs, seconds / len(truth.time_s), *located(text), truth)
+                yield _mocap_row(run, tool, needs, seconds / len(truth.time_s), *best_solutions(text), truth)
         out = Path(name) / "calibrated.toml"
         run3 = folder / "run3.csv", "--array", folder / "array-nominal.toml", "--truth", folder / "run3-truth.csv"
-        printed("magloc", "calibrate", *run3, "--out", out, "--json")
+        run_command("magloc", "calibrate", *run3, "--out", out, "--json")
         for run in RUNS[:2]:
             truth = read_truth(folder / f"run{run}-truth.csv")
-            text, seconds = printed("magloc", "locate", folder / f"run{run}.csv", "--array", out, "--json")
+            text, seconds = run_command("magloc", "locate", folder / f"run{run}.csv", "--array", out, "--json")
             needs = "nominal array, run 3 with its truth"
             row = _mocap_row(
-                run, "`magloc calibrate`, `locate`", needs, seconds / len(truth.time_s), *located(text), truth
+                run, "`magloc calibrate`, `locate`", needs, seconds / len(truth.time_s), *best_solutions(text), truth
             )
             yield replace(row, case=f"run {run}, calibrated on run 3")
 
@@ -131,7 +131,7 @@ def scipy_mocap(data: Path, size: Size) -> Iterator[Row]:
             truth,
         )
         yield replace(row, case=f"run {run}, calibrated on run 3")
-        plain, field = _corrected(nominal, matrix, values)
+        plain, field = _apply_calibration(nominal, matrix, values)
         fits = random_starts(plain, field, *_box(array), size.starts)
         row = _mocap_row(
             run,
@@ -148,7 +148,7 @@ def _places(fits: Fits) -> tuple[FloatArray, FloatArray]:
     return fits.state[:, :3], fits.covariance[:, :3, :3]
 
 
-def _corrected(array: SensorArray, matrix: FloatArray, values_T: FloatArray) -> tuple[SensorArray, FloatArray]:
+def _apply_calibration(array: SensorArray, matrix: FloatArray, values_T: FloatArray) -> tuple[SensorArray, FloatArray]:
     """Return an array of perfect sensors in the same places, and its readings by a linear calibration."""
     readings = values_T.reshape(len(values_T), -1, 3)
     extended = np.concatenate([readings, np.full((*readings.shape[:2], 1), 1e-4)], axis=2)
@@ -200,7 +200,7 @@ def _row(
 ) -> Row:
     places, covariance = found
     off, within = _off(places, truth)[rows], covariance[rows, :2, :2]
-    return judged_places(case, tool, needs, seconds, off, WRONG_M, within)
+    return row_of_offsets(case, tool, needs, seconds, off, WRONG_M, within)
 
 
 def _rows(size: Size) -> slice:
@@ -218,7 +218,7 @@ def our_array(data: Path, size: Size) -> Iterator[Row]:
         noisy.write_text(
             "noise_fraction = 0.03\n" + text.replace("noise_nT = 15000.0", "noise_nT = 2000.0"), encoding="utf-8"
         )
-        plain = stated(Path(name) / "plain", folder / "array.toml", SUBTRACTED)
+        plain = prepend_lines(Path(name) / "plain", folder / "array.toml", SUBTRACTED)
         four = ("--sensors", ",".join(FOUR))
         above = (*four, f"--region=z>{read_array(folder / 'array.toml').positions[:, 2].max():.4f}")
         known = (*four, "--known-moment-Am2", "0.045", "--known-moment-sigma-Am2", "0.0045")
@@ -232,7 +232,7 @@ def our_array(data: Path, size: Size) -> Iterator[Row]:
             ("4 sensors", "track", folder / "array.toml", "array file", four),
             ("4 sensors", "locate", noisy, f"array file with {NOISY}, known modulus ± 10 %", known),
         ):
-            text, seconds = printed("magloc", tool, folder / "readings.csv", "--array", array, *options, "--json")
+            text, seconds = run_command("magloc", tool, folder / "readings.csv", "--array", array, *options, "--json")
             label = (
                 f"`magloc {tool}`"
                 + (", noise stated" if array == noisy else "")
@@ -240,7 +240,7 @@ def our_array(data: Path, size: Size) -> Iterator[Row]:
                 + (", modulus known" if options == known else "")
                 + (", above the array" if options == above else "")
             )
-            yield _row(case, label, needs, seconds / n, located(text), truth, rows)
+            yield _row(case, label, needs, seconds / n, best_solutions(text), truth, rows)
 
 
 def _recorded(data: Path, four: bool) -> tuple[SensorArray, FloatArray, Truth]:
@@ -261,7 +261,7 @@ def scipy_array(data: Path, size: Size) -> Iterator[Row]:
         fits = random_starts(array, values[rows], low, high, size.starts)
         needs = f"array file, box of the magnet (above the array), {size.starts} starts"
         off, covariance = fits.state[:, :2] - truth.position_m[rows, :2], fits.covariance[:, :2, :2]
-        yield judged_places(case, "scipy `least_squares`", needs, fits.seconds, off, WRONG_M, covariance)
+        yield row_of_offsets(case, "scipy `least_squares`", needs, fits.seconds, off, WRONG_M, covariance)
 
 
 def filterpy_array(data: Path, size: Size) -> Iterator[Row]:

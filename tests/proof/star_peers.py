@@ -171,15 +171,13 @@ def fits_of(image: StarImage) -> bytes:
         assert image.picture is not None
         values = np.asarray(image.picture, dtype=">f4")
         head = {"SIMPLE": True, "BITPIX": -32, "NAXIS": 2, "NAXIS1": values.shape[1], "NAXIS2": values.shape[0]}
-        return _header(head) + _filled(values.tobytes())
+        return _header(head) + _pad(values.tobytes())
     values = np.asarray(image.lights, dtype=">f4")
     table: dict[str, str | int | bool] = {"XTENSION": "BINTABLE", "BITPIX": 8, "NAXIS": 2, "NAXIS1": 12}
     table |= {"NAXIS2": len(values), "PCOUNT": 0, "GCOUNT": 1, "TFIELDS": 3}
     for i, column in enumerate(("X", "Y", "FLUX"), 1):
         table |= {f"TTYPE{i}": column, f"TFORM{i}": "E"}
-    return (
-        _header({"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "EXTEND": True}) + _header(table) + _filled(values.tobytes())
-    )
+    return _header({"SIMPLE": True, "BITPIX": 8, "NAXIS": 0, "EXTEND": True}) + _header(table) + _pad(values.tobytes())
 
 
 def _header(cards: dict[str, Any]) -> bytes:
@@ -195,5 +193,5 @@ def _header(cards: dict[str, Any]) -> bytes:
     return text.ljust(-(-len(text) // BLOCK) * BLOCK).encode("ascii")
 
 
-def _filled(data: bytes) -> bytes:
+def _pad(data: bytes) -> bytes:
     return data + bytes(-len(data) % BLOCK)

@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -18,7 +17,7 @@ import adcs
 from adcs.stars.files import read_star_frames
 from adcs.stars.pictures import read_picture
 from arrays.typing import FloatArray
-from tests.proof import Part, Row, Rows, Size, judged, printed
+from tests.proof import Part, Row, Rows, Size, row_of_errors, run_command, with_nees
 from tests.proof.star_peers import (
     Centre,
     StarImage,
@@ -53,19 +52,18 @@ def centres(found: Sequence[Centre | None], true: Sequence[FloatArray]) -> Float
     )
 
 
-def solved(
+def row_of_centres(
     case: str, tool: str, needs: str, found: Sequence[Centre | None], true: Sequence[FloatArray], wrong: float
 ) -> Row:
     """Return the row of a solver; σ is that of the centre along an axis, where it states one."""
     error = centres(found, true)
     seconds = float(np.median([c.seconds for c in found if c is not None] or [np.nan]))
-    row = judged(case, tool, needs, seconds, error, wrong)
+    row = row_of_errors(case, tool, needs, seconds, error, wrong)
     sigma = np.array([np.nan if c is None or c.sigma_arcsec is None else c.sigma_arcsec for c in found])
     known = np.isfinite(sigma) & (error < wrong)
     if not known.any() or case.endswith(WITHOUT_TRUTH):
         return row
-    squares = np.square(error[known] / sigma[known]) / 2.0
-    return replace(row, nees=float(np.mean(squares)), inside=float(np.mean(2.0 * squares < 5.991)))
+    return with_nees(row, np.square(error[known] / sigma[known]), 2)
 
 
 def entries(text: str, key: str, milliseconds: float | None = None) -> list[Centre | None]:
@@ -110,10 +108,10 @@ def our_frames(data: Path, _: Size) -> Iterator[Row]:
     """Frames with the scale known to 5 %."""
     _, true = frame_images(data)
     options = ("--catalogue", "hipparcos", "--year", str(FRAME_YEAR), "--scale-tolerance", "0.05", "--json")
-    text, seconds = printed("adcs", "stars", data / "star-frames", *options)
+    text, seconds = run_command("adcs", "stars", data / "star-frames", *options)
     found = entries(text, "frames", 1e3 * seconds / len(true))
     needs = "lights, scale ± 5 %"
-    yield solved("50 frames", "`adcs stars`", needs, found, true, WRONG_FRAME_ARCSEC)
+    yield row_of_centres("50 frames", "`adcs stars`", needs, found, true, WRONG_FRAME_ARCSEC)
 
 
 # ---- photographs of a spacecraft
@@ -142,13 +140,13 @@ def our_space(data: Path, _: Size) -> Iterator[Row]:
     found, near = [], []
     for path, centre in zip(paths, true, strict=True):
         options = ("--catalogue", "hipparcos", "--year", "2018.9", "--json")
-        text, seconds = printed("adcs", "stars", path, *options)
+        text, seconds = run_command("adcs", "stars", path, *options)
         found += [None if c is None else c._replace(seconds=seconds) for c in entries(text, "pictures")]
         ra, dec = math.degrees(math.atan2(centre[1], centre[0])) % 360.0, math.degrees(math.asin(centre[2]))
-        text, seconds = printed("adcs", "stars", path, *options, "--near", f"{ra:.0f}", f"{dec:.0f}", "5")
+        text, seconds = run_command("adcs", "stars", path, *options, "--near", f"{ra:.0f}", f"{dec:.0f}", "5")
         near += [None if c is None else c._replace(seconds=seconds) for c in entries(text, "pictures")]
-    yield solved("3 pictures", "`adcs stars`", "picture", found, true, WRONG_PICTURE_ARCSEC)
-    yield solved("3 pictures", "`adcs stars --near`", "picture, centre ± 5°", near, true, WRONG_PICTURE_ARCSEC)
+    yield row_of_centres("3 pictures", "`adcs stars`", "picture", found, true, WRONG_PICTURE_ARCSEC)
+    yield row_of_centres("3 pictures", "`adcs stars --near`", "picture, centre ± 5°", near, true, WRONG_PICTURE_ARCSEC)
 
 
 # ---- photographs without truth
@@ -170,7 +168,7 @@ def photographs(data: Path) -> tuple[Images, tuple[FloatArray, ...]]:
 def _our_photographs(data: Path) -> tuple[Centre | None, ...]:
     found: list[Centre | None] = []
     for path in sorted((data / "star-photographs").iterdir()):
-        text, seconds = printed("adcs", "stars", path, "--catalogue", "hipparcos", "--json")
+        text, seconds = run_command("adcs", "stars", path, "--catalogue", "hipparcos", "--json")
         found += [None if c is None else c._replace(seconds=seconds) for c in entries(text, "pictures")]
     return tuple(found)
 
@@ -185,7 +183,9 @@ def our_photographs(data: Path, _: Size) -> Iterator[Row]:
     found = _our_photographs(data)
     error = np.array([np.inf if c is None else c.residual_arcsec for c in found])
     seconds = float(np.median([c.seconds for c in found if c is not None]))
-    yield judged("4 photographs, residual of the stars", "`adcs stars`", "picture", seconds, error, WRONG_FRAME_ARCSEC)
+    yield row_of_errors(
+        "4 photographs, residual of the stars", "`adcs stars`", "picture", seconds, error, WRONG_FRAME_ARCSEC
+    )
 
 
 # ---- other solvers
@@ -207,7 +207,7 @@ def _peer_rows(
     images, true = images[::every], true[::every]
     tool = tool if every == 1 else f"{tool}, every {every}th"
     solve = solver_of(images)
-    yield solved(case, tool, needs, [solve(image) for _, image in images], true, wrong)
+    yield row_of_centres(case, tool, needs, [solve(image) for _, image in images], true, wrong)
 
 
 def _tetra3rs(year: float) -> Callable[[Images], Solver]:

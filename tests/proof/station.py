@@ -17,7 +17,7 @@ from adcs.frames import R_ecef_from_eci, R_orbital_from_eci
 from adcs.satellite.magnetometer_calibration import MagnetometerPrior, calibrate_readings
 from arrays.typing import FloatArray
 from magloc.fields import geomagnetic
-from tests.proof import Part, Row, Size, judged
+from tests.proof import Part, Row, Size, row_of_errors
 
 PRIOR = MagnetometerPrior(
     noise_T=0.3e-6, bias_T=20e-6, gain=0.2, axes_rad=math.radians(5.0), field_error_T=0.3e-6, time_shift_s=300.0
@@ -43,14 +43,14 @@ def station_track(data: Path) -> tuple[FloatArray, FloatArray, FloatArray, Float
     return time_s, readings, at, (R_orbital_from_eci(position, velocity) @ field[..., None])[..., 0]
 
 
-def _judged(
+def _row_of_moduli(
     tool: str, needs: str, took: float, corrected: FloatArray, shift_s: float, data: tuple[FloatArray, ...]
 ) -> Row:
     """Return the row of the moduli of the second half, whose model is at the shifted times."""
     time_s, _, at, field = data
     model = np.linalg.norm(CubicSpline(at, field)(time_s + shift_s), axis=1)
     residual = np.linalg.norm(corrected, axis=1) - model
-    return judged(CASE, tool, needs, took, 1e9 * residual[_half(time_s, 1)], WRONG_NT)
+    return row_of_errors(CASE, tool, needs, took, 1e9 * residual[_half(time_s, 1)], WRONG_NT)
 
 
 def _half(time_s: FloatArray, number: int) -> slice:
@@ -68,7 +68,9 @@ def our_station(data: Path, _: Size) -> Iterator[Row]:
     result = calibrate_readings(time_s[rows], readings[rows], at, field, prior=PRIOR, attitude="none")
     took = time.process_time() - began
     needs = "positions, date; priors of bias, gains, clock"
-    yield _judged("`adcs.calibrate_magnetometer`", needs, took, result.applied(readings), result.time_shift_s, record)
+    yield _row_of_moduli(
+        "`adcs.calibrate_magnetometer`", needs, took, result.applied(readings), result.time_shift_s, record
+    )
 
 
 def scipy_station(data: Path, _: Size) -> Iterator[Row]:
@@ -96,12 +98,16 @@ def scipy_station(data: Path, _: Size) -> Iterator[Row]:
     began = time.process_time()
     plain = fit(False, 0.0)[0]
     took = time.process_time() - began
-    yield _judged("scipy, ellipsoid, clock as stated", "positions, date", took, corrected(plain, readings), 0.0, record)
+    yield _row_of_moduli(
+        "scipy, ellipsoid, clock as stated", "positions, date", took, corrected(plain, readings), 0.0, record
+    )
     began = time.process_time()
     shifted = min((fit(True, start) for start in (-600.0, -300.0, 0.0, 300.0, 600.0)), key=lambda each: each[1])[0]
     took = time.process_time() - began
     needs = "positions, date, starts of the clock's shift"
-    row = _judged("scipy, ellipsoid and clock", needs, took, corrected(shifted, readings), 100.0 * shifted[9], record)
+    row = _row_of_moduli(
+        "scipy, ellipsoid and clock", needs, took, corrected(shifted, readings), 100.0 * shifted[9], record
+    )
     yield row
 
 

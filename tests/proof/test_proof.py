@@ -21,14 +21,14 @@ from tests.proof import (
     better_peers,
     block,
     is_ours,
-    judged,
-    judged_places,
-    merged,
+    merge_rows,
+    number_text,
+    row_of_errors,
+    row_of_offsets,
     rows_of,
     table,
     value_of,
     with_block,
-    written,
 )
 from tests.proof.__main__ import QUICK, run
 from tests.proof.parts import PARTS
@@ -61,14 +61,14 @@ class TestTables:
         ("value", "text"), [(0.0951, "0.0951"), (12345.6, "12,346"), (1.0, "1.00"), (np.inf, "none"), (0.0, "0")]
     )
     def test_numbers(self, value: float, text: str) -> None:
-        assert written(value) == text
+        assert number_text(value) == text
         assert value_of(text) == pytest.approx(value, rel=5e-3)
 
     def test_rows_of_others_stay(self) -> None:
         """A run without scipy replaces our row and keeps the other, beside the case that it is of."""
         stored = [["run 1", "`magloc locate`", "old"], ["run 1", "scipy", "old"], ["run 2", "scipy", "old"]]
         fresh = [["run 1", "`magloc locate`", "new"]]
-        assert merged(fresh, stored) == [fresh[0], *stored[1:]]
+        assert merge_rows(fresh, stored) == [fresh[0], *stored[1:]]
 
     def test_better_ones_come_first(self) -> None:
         page = with_block(EMPTY, "made-up", table(part_of(), [OURS.cells, PEER.cells], STATED))
@@ -94,7 +94,7 @@ class TestTables:
 
 class TestFigures:
     def test_errors_without_an_answer_are_wrong(self) -> None:
-        found = judged("", "", "", 1.0, np.array([1.0, np.nan, 9.0, 2.0]), 5.0)
+        found = row_of_errors("", "", "", 1.0, np.array([1.0, np.nan, 9.0, 2.0]), 5.0)
         assert found.wrong == 0.5
         assert found.cells[COLUMNS.index("worst")] == "none"
 
@@ -103,7 +103,7 @@ class TestFigures:
         rng = np.random.default_rng(3)
         sqrt = np.array([[1.0, 0.0, 0.0], [0.5, 2.0, 0.0], [0.1, 0.3, 0.2]]) * 1e-3
         off = rng.normal(size=(4000, 3)) @ sqrt.T
-        found = judged_places("", "", "", 1.0, off, 1.0, np.tile(sqrt @ sqrt.T, (4000, 1, 1)))
+        found = row_of_offsets("", "", "", 1.0, off, 1.0, np.tile(sqrt @ sqrt.T, (4000, 1, 1)))
         assert found.nees == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 12000))
         assert found.inside == pytest.approx(0.95, abs=5.0 * np.sqrt(0.95 * 0.05 / 4000))
 

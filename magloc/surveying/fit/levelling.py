@@ -10,7 +10,7 @@ from scipy.interpolate import BSpline
 from scipy.sparse.linalg import spsolve
 
 from arrays.typing import FloatArray
-from magloc.levels import SIGMA_OF_MAD
+from magloc.measurement.plausibility import robust_sigma
 from magloc.navigation.flight_lines import FlightLine, covers_area, line_spacing
 
 FEWEST_LINES = 4
@@ -63,7 +63,7 @@ def line_levels(place_m: FloatArray, values: FloatArray, lines: Sequence[FlightL
         weighted = A.multiply(weights[:, None]).tocsr()
         solution = spsolve((weighted.T @ A + penalty).tocsc(), weighted.T @ (values[used] - middle))
         left = np.abs(values[used] - middle - A @ solution)
-        ratio = left / max(SIGMA_OF_MAD * float(np.median(left)), np.finfo(np.float64).tiny)
+        ratio = left / max(robust_sigma(left), np.finfo(np.float64).tiny)
         if number < _STEPS // 2:
             weights = np.minimum(1.0, _HUBER / np.maximum(ratio, _HUBER))
         else:

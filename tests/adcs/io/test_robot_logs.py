@@ -93,7 +93,7 @@ def px4(path: Path, **columns: object) -> Path:
     return path
 
 
-@pytest.mark.parametrize("value", [(0.0, 0.0, 0.0), (0.1, 0.2, 0.3)])
+@pytest.mark.parametrize("value", [(0.0, 0.0, 0.0), (0.1, 0.2, 0.3), (np.nan, np.nan, np.nan)])
 def test_a_magnetometer_that_stands_is_left_out_with_a_warning(adcs, tmp_path: Path, value: object) -> None:
     said = adcs("imu", px4(tmp_path / "a.ulg", magnetometer_ga=value), "--json")
     found = json.loads(said.out)
@@ -107,6 +107,8 @@ def test_a_magnetometer_that_stands_is_left_out_with_a_warning(adcs, tmp_path: P
         ({"without": ("gyro",)}, "found no gyro, expected one of PX4"),
         ({"without": ("accelerometer",)}, "found no accelerometer, expected one of PX4"),
         ({"gyro_rad": (0.0, 0.0, 0.0)}, "found a gyro sensor_combined.gyro_rad[0] that stands at"),
+        ({"gyro_rad": (np.nan, np.nan, np.nan)}, "found a gyro sensor_combined.gyro_rad[0] that stands at [nan"),
+        ({"accelerometer_m_s2": (np.nan, np.nan, np.nan)}, "that stands at [nan, nan, nan], expected one that works"),
         ({"timestamp": np.tile(np.arange(1_000_000, 5_000_000, 10_000), 2)}, "expected a clock that advances"),
     ],
 )

@@ -192,6 +192,16 @@ class TestFaultyReadings:
         found = magloc.check_quality(replace(PAIR, sensors=PAIR.sensors[:1]), alone)
         assert set(flags) <= set(found.flags)
 
+    def test_saturated_readings_are_missing(self) -> None:
+        """Readings in another unit, beyond the range that the sensors state, do not hide the remark on the unit."""
+        sensors = tuple(replace(sensor, saturation_T=1.5e-4) for sensor in PAIR.sensors)
+        found = magloc.check_quality(replace(PAIR, sensors=sensors), replace(ROWS, values_T=1e3 * ROWS.values_T))
+        assert found.missing.all()
+        assert found.lag is None
+        assert [(c.sensor, c.remark) for c in found.checks if c.name == "field"] == [
+            (sensor.id, "not the Earth's field: is it nT?") for sensor in sensors
+        ]
+
     def test_a_place_that_does_not_change(self) -> None:
         still = replace(ROWS, array_position_m=np.tile([1.0, 2.0, 0.5], (len(ROWS), 1)))
         assert "length" in magloc.check_quality(PAIR, still).flags

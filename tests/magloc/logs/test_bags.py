@@ -39,14 +39,15 @@ def messages(store, first: bool):
         yield "/name", "std_msgs/msg/String", at, of["std_msgs/msg/String"]("text")
 
 
-def write_ros1(path: Path) -> Path:
+def write_ros1(path: Path, restart: int = N) -> Path:
+    """Write a bag in which all drivers start again at a row."""
     store = get_typestore(Stores.ROS1_NOETIC)
     with Writer1(path) as writer:
         known = {}
-        for topic, kind, at, message in messages(store, True):
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(known[topic], at, store.serialize_ros1(message, kind))
+        for i, (topic, kind, at, message) in enumerate(messages(store, True)):
+            if (key := (topic, i // 4 < restart)) not in known:
+                known[key] = writer.add_connection(topic, kind, typestore=store, callerid=f"/driver{key[1]}")
+            writer.write(known[key], at, store.serialize_ros1(message, kind))
     return path
 
 
@@ -98,3 +99,11 @@ def test_a_damaged_bag_is_refused(tmp_path: Path, name: str) -> None:
     path.write_bytes(magic + bytes(100))
     with pytest.raises(InputError, match="bag that cannot be read"):
         magloc.read_log(path)
+
+
+def test_a_driver_that_starts_again_loses_no_rows(tmp_path: Path) -> None:
+    """ROS 1 records it as a second publisher of the same topic."""
+    log = magloc.read_log(write_ros1(tmp_path / "flight.bag", restart=15))
+    time_s, field_T = log.vectors([f"/mag.magnetic_field.{axis}" for axis in "xyz"])
+    np.testing.assert_allclose(time_s, TIME_S, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(field_T, FIELD_T, rtol=1e-15)

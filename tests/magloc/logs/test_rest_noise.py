@@ -73,6 +73,12 @@ def test_few_readings_are_refused() -> None:
         noise_of(white(5, 150))
 
 
+def test_readings_that_do_not_vary_are_refused() -> None:
+    """Steps of the sensor are ten times its noise, so that it reads one value at rest."""
+    with pytest.raises(ValueError, match=r"Input b\.x must have readings that vary at rest.*0\.0\] in all rows"):
+        noise_of(10.0 * np.round(0.1 * white(8, 300)))
+
+
 def test_the_noise_goes_into_array_and_scenario_file(run, tmp_path: Path) -> None:
     flight = Flight(6, duration_s=60.0, swing_rad=0.0)
     path, out = tmp_path / "rest.ulg", tmp_path / "a.toml"

@@ -80,6 +80,11 @@ class TestTerrain:
         assert (magloc.Terrain(-7.3).depth_of(places) == -7.3 - places[:, 2]).all()
         assert not FLAT.slope_at(places[:, :2]).any()
 
+    @pytest.mark.parametrize("sigma_m", [-0.1, np.nan, np.inf])
+    def test_an_impossible_sigma_is_refused(self, sigma_m: float) -> None:
+        with pytest.raises(ValueError, match="Input sigma_m must be zero or a positive number"):
+            magloc.Terrain(sigma_m=sigma_m)
+
     @pytest.mark.parametrize("number", [2, 5])
     def test_points_on_a_line_are_refused(self, number: int) -> None:
         line = np.outer(np.arange(float(number)), [1.0, 2.0, 0.1])
