@@ -205,7 +205,7 @@ def calibrate_log(
             "Input log must have readings that fit one motion; instead received others. Check units."
         ) from None
     problem = fit.estimate.problem
-    ranges = np.array([max(float(np.ptp(one.values)), 1e-6) for one in problem.currents])
+    ranges = np.array([one.span for one in problem.currents])
     terms = terms_of(
         problem.layout,
         fit.estimate.parameters,

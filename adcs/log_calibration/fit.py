@@ -81,7 +81,7 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
     currents = tuple(series.finite() for series in log.currents)
     start = find_start(data, magnetometers)
     layout = Layout(tuple(one.name for one in magnetometers), tuple(one.name for one in currents))
-    ranges = np.array([max(float(np.ptp(one.values)), 1e-6) for one in currents])
+    ranges = np.array([one.span for one in currents])
     sigma = layout.prior_sigma(field, ranges)
     prior = np.zeros(layout.size)
     prior[INCLINATION] = field.inclination_rad
