@@ -69,8 +69,8 @@ class VehicleLog:
     Raises
     ------
     ValueError
-        The shapes do not agree, times do not ascend, a gyro or accelerometer or magnetometer is missing, or the log is
-        shorter than 2 s.
+        The shapes do not agree, times do not ascend, gyro or accelerometer have fewer than ten readings, a magnetometer
+        is missing, a unit is wrong, or the log is shorter than 2 s.
 
     Examples
     --------
@@ -93,8 +93,8 @@ class VehicleLog:
         for name, values in (("gyro_rad_s", self.gyro_rad_s), ("acceleration_m_s2", self.acceleration_m_s2)):
             if values.shape != (n, 3):
                 raise ValueError(f"Input {name} must have shape ({n}, 3); instead received {values.shape}.")
-            if np.isfinite(values).all(axis=1).sum() < 2:
-                raise ValueError(f"Input {name} must have two readings at least; instead received fewer.")
+            if (read := np.isfinite(values).all(axis=1).sum()) < FEWEST_ROWS:
+                raise ValueError(f"Input {name} must have {FEWEST_ROWS} readings at least; instead received {read}.")
         steps_s(self.time_s)
         if np.ptp(self.time_s) < SHORTEST_S:
             raise ValueError(

@@ -148,7 +148,7 @@ def _fit_mounting(time_s: FloatArray, q: FloatArray, at: IntArray, readings: Flo
     """Return the mounting and the rate of the heading with the least residuals."""
     choices = mountings()
     y = np.einsum("qji,nj->niq", choices, readings).reshape(-1, len(choices))
-    length = float(np.ptp(time_s[at]))
+    length = min(float(np.ptp(time_s[at])), _WINDOW_S)  # a gap may follow the last reading
     steps = max(1, math.ceil(_LARGEST_BIAS_RAD_S * length / 2.0 / _PHASE_RAD))
     rates = _LARGEST_BIAS_RAD_S * np.arange(-steps, steps + 1) / steps
     squares = np.empty((len(rates), len(choices)))
