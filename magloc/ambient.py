@@ -112,7 +112,12 @@ def modulus_at(place: Place) -> float:
     """Return the modulus of the geomagnetic field at a place and date [T]."""
     import numpy as np
 
-    return float(np.linalg.norm(_of_model(place)[0]))
+    return float(np.linalg.norm(field_at(place)))
+
+
+def field_at(place: Place) -> NDArray[np.float64]:
+    """Return the geomagnetic field (3,) at a place and date [T]: east, north, up."""
+    return _of_model(place)[0]
 
 
 def _of_model(place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

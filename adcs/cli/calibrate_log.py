@@ -46,19 +46,21 @@ def calibrate_log(
     currents : str, optional
         Columns or channels with currents or throttles, separated by commas; by default those that are found.
     out : Path
-        File to write: array file (.toml), or parameters of PX4 (.params) or ArduPilot (.param, .parm).
+        File to write: array file of one magnetometer (.toml), or parameters of PX4 (.params) or ArduPilot (.param,
+        .parm).
     json : bool
         Print one JSON object, in place of the table.
     common : QuietOptions
         Common options.
     """
-    from adcs.log_calibration.autopilot_files import axes_warning, writer_of
+    from adcs.log_calibration.autopilot_files import axes_warning, refuse_unplaced, writer_of
 
     refuse_one_for_two({"LOG": log, "--out": out})
     refuse_unwritable(out, "--out")
     write = writer_of(out)
     names = [] if currents is None else [name.strip() for name in currents.split(",") if name.strip()]
     file = adcs.read_vehicle(log, config, names)
+    refuse_unplaced(out, file.log)
     field_T = _field(place or file.place, date or file.date, stated=place is not None)
     began = time.perf_counter()
     with naming(str(log)):
@@ -77,17 +79,11 @@ def calibrate_log(
 
 def _field(place: Vector | None, date: str | None, *, stated: bool) -> FloatArray | None:
     """Return the field of the geomagnetic model [T]: east, north, up."""
-    import numpy as np
-
     if place is None or date is None:
         if stated:
             raise InputError("--place: found no date of the log, expected --date with it.")
         return None
-    from magloc.fields.geomagnetic import field_enu
+    from magloc.ambient import Place, field_at
 
-    try:
-        when = np.datetime64(date)
-    except ValueError:
-        raise InputError(f"--date: found {date!r}, expected a date such as 2026-11-21.") from None
-    with naming_options("latitude_deg", "longitude_deg", "height_m", "date"):
-        return field_enu(*place, when)
+    with naming_options("place", "date"):
+        return field_at(Place(*place, date, "IGRF-14"))

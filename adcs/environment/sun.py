@@ -38,6 +38,11 @@ def earth_velocity_m_s(utc: Instants) -> FloatArray:
     return velocity
 
 
+def earth_radius_rad(position_eci_m: ArrayLike) -> FloatArray:
+    """Return the angular radius of the Earth (...) [rad] at positions (..., 3); π/2 on the ground."""
+    return np.arcsin(np.minimum(EARTH_RADIUS_M / np.linalg.norm(position_eci_m, axis=-1), 1.0))
+
+
 def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLike) -> FloatArray:
     r"""Return the share of the Sun's disc that the Earth, a sphere without an atmosphere, does not hide.
 
@@ -54,7 +59,7 @@ def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLik
     to_sun = np.asarray(sun_position_eci_m, dtype=np.float64) - position
     sun_distance, radius = np.linalg.norm(to_sun, axis=-1), np.linalg.norm(position, axis=-1)
     a = np.arcsin(np.minimum(SUN_RADIUS_M / sun_distance, 1.0))
-    b = np.arcsin(np.minimum(EARTH_RADIUS_M / radius, 1.0))
+    b = earth_radius_rad(position)
     c = np.arccos(np.clip(-np.sum(position * to_sun, axis=-1) / (radius * sun_distance), -1.0, 1.0))
     # Distance of the common chord from the Sun's centre, clipped where the circles do not cross.
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -81,4 +81,4 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
 def unseen_line(torque_Nm: Mapping[float, float]) -> list[str]:
     """Return a line with the largest torque that the readings do not show, by period; no line without any."""
     each = ", ".join(f"{torque:.2g} N·m ({period:g} s)" for period, torque in torque_Nm.items())
-    return [f"{'largest torque unseen (its period)':34s}{each}"] if each else []
+    return [f"{'largest unseen torque (its period)':36s}{each}"] if each else []

@@ -28,11 +28,11 @@ from adcs.io.log_layout import (
     Three,
 )
 from adcs.io.robot_logs import robot_record
-from adcs.io.telemetry_files import TIME, columns_of, read_named
+from adcs.io.telemetry_files import TIME, columns_of, named_table
 from adcs.satellite.vector_record import GYRO_SAMPLES, GyroSamples
-from arrays.io.csv import read_table
+from arrays.io.csv import table_of_text
 from arrays.io.errors import LARGEST, InputError, naming
-from arrays.io.text import read_bytes
+from arrays.io.text import read_bytes, read_text
 from arrays.io.toml import File, Table, one_of, read_toml, section_of
 from arrays.typing import BoolArray, FloatArray
 from magloc.logs.read import log_reader, read_log
@@ -159,7 +159,8 @@ def imu_log(path: str | PathLike[str], layout: tuple[str, dict[str, Any]] | None
     """Return the log of :func:`read_imu`; ``layout`` is the path and the table of a layout that is already read."""
     is_binary = log_reader(path) is not None
     if not _is_matlab(path) and not is_binary:
-        return _csv_log(path, None if layout is None else section_of(*layout, ImuFile).log)
+        named = None if layout is None else section_of(*layout, ImuFile).log
+        return csv_log(read_text(path, "a CSV file"), str(path), named)
     if layout is not None:
         kind = "the log of an autopilot" if is_binary else "a MAT file"
         raise InputError(f"{path}: found {kind} with a layout, expected a CSV file, or none.")
@@ -172,26 +173,27 @@ def _autopilot_log(path: str | PathLike[str]) -> ImuLog:
     return ImuLog(found.record, None, every, None, found.own_attitude, found.lag_s)
 
 
-def _csv_log(path: str | PathLike[str], named: ImuTable | None) -> ImuLog:
+def csv_log(text: str, name: str, named: ImuTable | None) -> ImuLog:
+    """Return the log of a CSV file's text, by a layout or with the standard columns; `name` is for errors."""
     expected = "a header with a time, and columns of gyro, accelerometer and magnetometer"
     if named is None:
-        table = read_table(path, expected)
+        table = table_of_text(text, name, expected)
         given = standard_table(table.header)
         try:
             for group in layout_of_table(given).columns.values():
-                for name in group.columns:
-                    table.require(name, group.columns)
+                for column in group.columns:
+                    table.require(column, group.columns)
         except InputError as error:
             raise InputError(f"{str(error).removesuffix('.')}; a layout (--config) names other columns.") from None
     else:
         given = named
         more = () if given.moving is None else (given.moving,)
-        table = read_named(path, expected, layout_of_table(given), more)
+        table = named_table(text, name, expected, layout_of_table(given), more)
     time_s, values = columns_of(table, layout_of_table(given))
     truth = values.pop("truth", None)
     values.setdefault("field_T", np.full((len(time_s), 3), np.nan))
     samples: GyroSamples = given.gyro.samples  # type: ignore[assignment]
-    with naming(str(path)):
+    with naming(name):
         record = InertialMagneticRecord(time_s, **values, gyro_samples=samples)
     return ImuLog(
         record,

@@ -27,8 +27,9 @@ import numpy as np
 
 from adcs.io.log_layout import STANDARD, LogLayout
 from adcs.satellite.telemetry import MOST_INSTANTS, Telemetry, steps_within, usual_step_s
-from arrays.io.csv import Table, read_table
+from arrays.io.csv import Table, read_table, table_of_text
 from arrays.io.errors import InputError, naming
+from arrays.io.text import read_text
 from arrays.io.toml import check_keys
 from arrays.typing import FloatArray
 
@@ -75,19 +76,20 @@ def read_telemetry(
         check_keys(f"{path}, line {table.header_line}", dict.fromkeys(table.header), known, "column")
         layout = LogLayout(_UNUSED, TIME, "seconds", {k: v for k, v in STANDARD.items() if table.has_group(v.columns)})
     else:
-        table = read_named(path, expected, layout)
+        table = named_table(read_text(path, "a CSV file"), str(path), expected, layout)
     time_s, columns = columns_of(table, layout)
     _refuse_many(table, layout.time, time_s, step_s)
     with naming(str(path)):
         return Telemetry(time_s, **columns, step_s=step_s)
 
 
-def read_named(path: str | PathLike[str], expected: str, layout: LogLayout, more: Sequence[str] = ()) -> Table:
-    """Read the columns that a layout names, and ``more`` ones."""
-    names = [layout.time, *(name for one in layout.columns.values() for name in one.columns), *more]
-    table = read_table(path, expected, only=names, instant=[layout.time] if layout.time_format == "utc" else [])
-    for name in names:
-        table.require(name, names)
+def named_table(text: str, name: str, expected: str, layout: LogLayout, more: Sequence[str] = ()) -> Table:
+    """Return the columns that a layout names, and ``more`` ones, of a CSV file's text; `name` is for errors."""
+    names = [layout.time, *(column for one in layout.columns.values() for column in one.columns), *more]
+    instant = [layout.time] if layout.time_format == "utc" else []
+    table = table_of_text(text, name, expected, only=names, instant=instant)
+    for column in names:
+        table.require(column, names)
     return table
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import itertools
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -10,30 +12,25 @@ from pathlib import Path
 
 import numpy as np
 
-from adcs.io.imu_files import read_imu
+from adcs.io.imu_files import ImuFile, csv_log, read_imu
 from adcs.log_calibration.record import Series, VehicleLog
-from arrays.io.csv import read_table
+from arrays.io.csv import table_of_header, table_of_text
 from arrays.io.errors import InputError, naming
+from arrays.io.text import read_text
+from arrays.io.toml import read_toml, section_of
 from arrays.typing import FloatArray
 from magloc.logs.channels import Log
 from magloc.logs.read import log_reader, read_log
+from magloc.logs.sensors import find_sensors
+from magloc.logs.time_base import resample
 
-_GYRO = ("sensor_combined.gyro_rad[{012}]", "IMU.Gyr{XYZ}", "*angular_velocity.{xyz}")
-_FORCE = ("sensor_combined.accelerometer_m_s2[{012}]", "IMU.Acc{XYZ}", "*linear_acceleration.{xyz}")
-_MAGNETOMETERS = (
-    ("sensor_mag.{xyz}", "sensor_mag[1].{xyz}", "sensor_mag[2].{xyz}", "sensor_mag[3].{xyz}"),
-    ("vehicle_magnetometer.magnetometer_ga[{012}]", "vehicle_magnetometer[1].magnetometer_ga[{012}]"),
-    ("sensor_combined.magnetometer_ga[{012}]",),
-    ("MAG.Mag{XYZ}", "MAG[1].Mag{XYZ}", "MAG[2].Mag{XYZ}"),
-    ("*magnetic_field.{xyz}",),
-)
 _CURRENTS = ("battery_status.current_a", "BAT.Curr", "actuator_controls_0.control[3]", "CTUN.ThO")
 _PLACES = (
     ("vehicle_gps_position", "lat", "lon", "alt"),
     ("vehicle_gps_position", "latitude_deg", "longitude_deg", "altitude_msl_m"),
     ("GPS", "Lat", "Lng", "Alt"),
 )
-_LEAST_ROWS, _LEAST_RATE_Hz, _LONGEST_GAP_S = 20, 5.0, 0.25
+_LEAST_ROWS, _LEAST_RATE_Hz = 20, 5.0
 _LEAST_RANGE = {"A": 0.5, "": 0.02}
 _TEXT_CURRENTS = ("_A", "throttle")
 
@@ -95,8 +92,8 @@ def read_vehicle(
     """
     if log_reader(path) is None:
         log = _text_log(path, layout, currents)
-        alive = tuple(one for one in log.magnetometers if _is_alive(one))
-        dead = [one.name for one in log.magnetometers if not _is_alive(one)]
+        alive = tuple(one for one in log.magnetometers if _varies(one))
+        dead = [one.name for one in log.magnetometers if not _varies(one)]
         if not alive:
             return VehicleFile(log)
         warnings = tuple(f"{name} has no readings that vary, and is left out" for name in dead)
@@ -108,43 +105,63 @@ def read_vehicle(
 
 def _text_log(path: str | PathLike[str], layout: str | PathLike[str] | None, currents: Sequence[str]) -> VehicleLog:
     """Return the log of a CSV or MAT file."""
-    record = read_imu(path, layout).record
+    found: tuple[list[Series], list[Series]] = [], []
+    if Path(path).suffix.lower() == ".mat":
+        record = read_imu(path, layout).record
+        if currents:
+            raise InputError(f"{path}: found a MAT file, which has no currents, expected no --currents.")
+    else:
+        described = {} if layout is None else read_toml(layout, "a layout of a log")
+        named = None if layout is None else section_of(str(layout), described, ImuFile).log
+        text = read_text(path, "a CSV file")  # once: a pipe has no second reading
+        record = csv_log(text, str(path), named).record
+        own = () if named is None or named.magnetometer is None else named.magnetometer.columns
+        found = _more_columns(text, str(path), record.time_s, own, currents)
     magnetometers = [Series("field", record.time_s, record.field_T)] if record.has_field else []
-    found: list[Series] = []
-    if Path(path).suffix.lower() != ".mat":
-        table = read_table(path, "a header with a time, and columns of gyro and accelerometer")
-        header = table.header
-        ids = [name.removesuffix("_x_nT") for name in header if name.endswith("_x_nT")]
-        for one in ids:
-            columns = [f"{one}_{axis}_nT" for axis in "xyz"]
-            if one != "field" and table.has_group(columns):
-                values = 1e-9 * table.finite_or_missing(columns)
-                magnetometers.append(Series(one, record.time_s, values))
-        for name in currents:
-            table.require(name, ())
-        names = currents or [name for name in header if name.endswith(_TEXT_CURRENTS)]
-        found = [Series(name, record.time_s, table.finite_or_missing([name])[:, 0]) for name in names]
-    elif currents:
-        raise InputError(f"{path}: found a MAT file, which has no currents, expected no --currents.")
     with naming(str(path)):
         return VehicleLog(
             record.time_s,
             record.rate_rad_s,
             record.acceleration_m_s2,
-            tuple(magnetometers),
-            tuple(one for one in found if _varies(one, 0.0)),
+            (*magnetometers, *found[0]),
+            tuple(one for one in found[1] if _varies(one)),
             record.gyro_samples,
         )
 
 
+def _more_columns(
+    text: str, name: str, time_s: FloatArray, own: Sequence[str], currents: Sequence[str]
+) -> tuple[list[Series], list[Series]]:
+    """Return the other magnetometers and the currents of a CSV file's text; ``own``: columns of the first sensor."""
+    expected = "a header with a time, and columns of gyro and accelerometer"
+    head = table_of_header(text, name, expected)
+    ids = [column.removesuffix("_x_nT") for column in head.header if column.endswith("_x_nT")]
+    groups = {one: [f"{one}_{axis}_nT" for axis in "xyz"] for one in ids if one != "field" and f"{one}_x_nT" not in own}
+    for columns in groups.values():
+        head.has_group(columns)
+    for current in currents:
+        head.require(current, ())
+    names = currents or [column for column in head.header if column.endswith(_TEXT_CURRENTS)]
+    table = table_of_text(text, name, expected, only={*names, *itertools.chain(*groups.values())})
+    return (
+        [Series(one, time_s, 1e-9 * table.finite_or_missing(columns)) for one, columns in groups.items()],
+        [Series(current, time_s, table.finite_or_missing([current])[:, 0]) for current in names],
+    )
+
+
 def _binary_log(log: Log, currents: Sequence[str]) -> VehicleFile:
     """Return the sensors of the log of an autopilot or robot."""
-    gyro, force = (
-        _first_triple(log, patterns, what) for patterns, what in ((_GYRO, "gyro"), (_FORCE, "accelerometer"))
-    )
-    choices = [[found for one in group if (found := _triple(log, one)) is not None] for group in _MAGNETOMETERS]
-    good = [[one for one in group if _is_dense(one)] for group in choices]
-    best = next((group for group in good if group), [])
+    sensors = find_sensors(log)
+    gyro, force = sensors.gyro, sensors.accelerometer
+    found = [
+        Series(one.name.rpartition(".")[0], one.time_s, one.values, _device(log, one.name))
+        for one in sensors.magnetometers
+    ]
+    good = [one for one in found if _is_dense(one)]
+    # Fields that the autopilot has not corrected, or else those of the first kind of message.
+    kinds = [_message(one) for one in good]
+    first = "sensor_mag" if "sensor_mag" in kinds else next(iter(kinds), "")
+    best = [one for one, kind in zip(good, kinds, strict=True) if kind == first]
     if not best:
         expected = "a magnetometer of 5 Hz or more, such as sensor_mag (PX4), MAG (ArduPilot), magnetic_field (ROS)"
         raise InputError(f"{log.path}: found no readings of a magnetometer, expected {expected}.")
@@ -159,15 +176,15 @@ def _binary_log(log: Log, currents: Sequence[str]) -> VehicleFile:
         best, corrected = [raw], False
     with naming(log.path):
         vehicle = VehicleLog(
-            gyro.time_s, gyro.values, _at(force, gyro.time_s), tuple(best), tuple(_whole(one) for one in series)
+            gyro.time_s, gyro.values, resample(gyro.time_s, force.time_s, force.values), tuple(best), tuple(series)
         )
     place = _place(log)
     date = None
     if log.unix_zero_s is not None:
         at = datetime.datetime.fromtimestamp(log.unix_zero_s + float(gyro.time_s[0]), datetime.UTC)
         date = at.date().isoformat()
-    warnings = () if not corrected else (_CORRECTED.format(best[0].name.partition(".")[0]),)
-    return VehicleFile(vehicle, place, date, corrected, warnings)
+    warnings = [_CORRECTED.format(best[0].name)] if corrected else []
+    return VehicleFile(vehicle, place, date, corrected, (*warnings, *sensors.warnings))
 
 
 _CORRECTED = (
@@ -197,19 +214,9 @@ def _uncorrected(series: Series, log: Log) -> Series | None:
     return replace(series, values=raw, device_id=int(values[f"{begin}ID"]))
 
 
-def _triple(log: Log, pattern: str) -> Series | None:
-    """Return the vector channel of a pattern; None if the log has none."""
-    begin, axes = pattern.index("{"), pattern[pattern.index("{") + 1 : pattern.index("}")]
-    head, tail = pattern[:begin], pattern[pattern.index("}") + 1 :]
-    if head.startswith("*"):
-        heads = [name.removesuffix(f"{axes[0]}{tail}") for name in log if name.endswith(f"{head[1:]}{axes[0]}{tail}")]
-        head = heads[0] if heads else head
-    names = [f"{head}{axis}{tail}" for axis in axes]
-    if any(name not in log for name in names):
-        return None
-    time_s, values = log.vectors(names)
-    name = head.rstrip("[.").removesuffix("Mag").rstrip(".").partition(".magnetometer_ga")[0]
-    return Series(name, time_s, values, _device(log, names[0]))
+def _message(series: Series) -> str:
+    """Return the kind of message of a sensor, without the number of an instance."""
+    return re.sub(r"(\d|\[\d+\])$", "", series.name)
 
 
 def _device(log: Log, name: str) -> int:
@@ -218,45 +225,16 @@ def _device(log: Log, name: str) -> int:
     return int(log[beside].values[0]) if beside in log and len(log[beside]) else 0
 
 
-def _first_triple(log: Log, patterns: Sequence[str], what: str) -> Series:
-    for pattern in patterns:
-        found = _triple(log, pattern)
-        if found is not None:
-            return found
-    shown = " or ".join(pattern.translate(str.maketrans("{}", "[]")) for pattern in patterns)
-    raise InputError(f"{log.path}: found no {what}, expected channels such as {shown}.")
-
-
 def _is_dense(series: Series) -> bool:
     """Return True for a sensor with readings often enough that are not all equal."""
     often = len(series.time_s) >= _LEAST_RATE_Hz * np.ptp(series.time_s)
-    return len(series.time_s) >= _LEAST_ROWS and bool(often) and _is_alive(series)
+    return len(series.time_s) >= _LEAST_ROWS and bool(often) and _varies(series)
 
 
-def _is_alive(series: Series) -> bool:
-    """Return True for a magnetometer whose readings are not all missing or equal."""
+def _varies(series: Series, least: float = 0.0) -> bool:
+    """Return True for a series whose readings are not all missing, or equal within a range."""
     values = series.finite().values
-    return len(values) > 1 and bool((np.ptp(values, axis=0) > 0.0).any())
-
-
-def _varies(series: Series, least: float) -> bool:
-    known = series.values[np.isfinite(series.values)]
-    return len(known) > 1 and bool(np.ptp(known) > least)
-
-
-def _whole(series: Series) -> Series:
-    """Return a current as numbers that are not missing."""
-    return replace(series, values=np.asarray(series.values, np.float64))
-
-
-def _at(series: Series, time_s: FloatArray) -> FloatArray:
-    """Return a vector series at other times, NaN where its next sample is far."""
-    clean = series.finite()
-    values = np.stack([np.interp(time_s, clean.time_s, axis) for axis in clean.values.T], axis=1)
-    after = np.clip(np.searchsorted(clean.time_s, time_s), 1, len(clean.time_s) - 1)
-    far = np.minimum(np.abs(clean.time_s[after] - time_s), np.abs(time_s - clean.time_s[after - 1])) > _LONGEST_GAP_S
-    values[far] = np.nan
-    return values
+    return len(values) > 1 and bool((np.ptp(values, axis=0) > least).any())
 
 
 def _place(log: Log) -> tuple[float, float, float] | None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from adcs.environment.orbit import EARTH_RADIUS_M
+from adcs.environment.sun import earth_radius_rad
 from adcs.kalman.error_state import AttitudeState, AttitudeTracks, FilterSettings, SensorSet
 from adcs.kalman.mekf import deviations, residuals
 from adcs.quaternion import rotate_back
@@ -130,8 +130,7 @@ def _star_gaps(record: Record, estimates: AttitudeTracks, run: int) -> list[Atti
 def _sky(record: Record, run: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return direction to the Sun (n, 3), angular radius of the Earth (n,) and visible part of the Sun (n,)."""
     around = record.environment
-    radius = np.arcsin(np.minimum(1.0, EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[run], axis=-1)))
-    return around.sun_orbital[run], radius, around.illuminated[run]
+    return around.sun_orbital[run], earth_radius_rad(around.position_eci_m[run]), around.illuminated[run]
 
 
 def _logged(record: Record, run: int) -> BoolArray:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import polar
 
 from adcs.log_calibration.calibrate import LogCalibration
+from adcs.log_calibration.record import VehicleLog
 from adcs.log_calibration.rotations import nearest_rotation, rotation_matrices
 from adcs.log_calibration.terms import is_throttle
 from arrays.array_file import write_array
@@ -126,6 +127,15 @@ WRITERS: dict[str, Callable[[LogCalibration, Path], None]] = {
     ".param": _write_ardupilot,
     ".parm": _write_ardupilot,
 }
+
+
+def refuse_unplaced(path: Path, log: VehicleLog) -> None:
+    """Refuse an array file for several magnetometers: a log does not state their places."""
+    if path.suffix.lower() == ".toml" and len(log.magnetometers) > 1:
+        found = f"found {len(log.magnetometers)} magnetometers, whose places the log does not state"
+        raise InputError(
+            f"--out: {found}, expected .params (PX4), .param or .parm (ArduPilot) in place of an array file."
+        )
 
 
 def writer_of(path: Path) -> Callable[[LogCalibration, Path], None]:

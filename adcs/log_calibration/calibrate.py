@@ -27,6 +27,7 @@ MODEL_ERROR_T = 150e-9
 _LARGEST_FIELD_T = 70e-6
 _TURNED_DEG = 20.0
 _LARGE_SOFT_IRON = 0.3
+_LARGE_NOISE = 0.1  # of the field
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,10 @@ class LogCalibration(Drawn):
         return np.asarray(raw @ np.linalg.inv(self.matrix(m)).T)
 
     def array(self) -> SensorArray:
-        """Return the magnetometers as an array in body axes, with their calibration."""
+        """Return the magnetometer as an array in body axes, with its calibration.
+
+        Raises ValueError for several magnetometers: their places are unknown.
+        """
         noise = self.fit.estimate.problem.noise.white_uT
         sensors = []
         for m, series in enumerate(self.log.magnetometers):
@@ -184,7 +188,8 @@ def calibrate_log(
     Raises
     ------
     ValueError
-        The field has another shape, or a magnetometer has fewer than ten readings during the inertial readings.
+        The field has another shape, or a magnetometer has fewer than ten readings during the inertial readings, equal
+        readings, or a reversed axis.
 
     Examples
     --------
@@ -205,7 +210,7 @@ def calibrate_log(
             "Input log must have readings that fit one motion; instead received others. Check units."
         ) from None
     problem = fit.estimate.problem
-    ranges = np.array([max(float(np.ptp(one.values)), 1e-6) for one in problem.currents])
+    ranges = np.array([one.span for one in problem.currents])
     terms = terms_of(
         problem.layout,
         fit.estimate.parameters,
@@ -229,6 +234,13 @@ def _flags(fit: LogFit, terms: Terms) -> Iterator[str]:
         name = series.name
         matrix = estimate.parameters[estimate.problem.layout.matrix(m)].reshape(3, 3)
         _, symmetric, turn = soft_iron(matrix, fit.mountings[m])
+        noise_uT = float(estimate.problem.noise.white_uT[m])
+        if noise_uT > _LARGE_NOISE * np.linalg.norm(estimate.field_uT[0]):
+            yield (
+                f"{name} contradicts gyro and accelerometer by {1e3 * noise_uT:.0f} nT, expected less than a tenth of"
+                " the field: check signs, axes, units and clocks"
+            )
+            continue
         number, word = nearest_rotation(fit.mountings[m].T)
         if number:
             yield (

@@ -10,7 +10,7 @@ import numpy as np
 
 from adcs.log_calibration.arrow import ArrowSystem, Solution
 from adcs.log_calibration.linear import LinearModel
-from adcs.log_calibration.parameters import GYRO_BIAS, INCLINATION, MODULUS, FieldPrior, Layout
+from adcs.log_calibration.parameters import AXES, GYRO_BIAS, INCLINATION, MODULUS, FieldPrior, Layout
 from adcs.log_calibration.record import FEWEST_ROWS, InertialData, VehicleLog
 from adcs.log_calibration.start import find_start
 from adcs.log_calibration.system import Estimate, Noise, Problem, slow_field
@@ -79,9 +79,12 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
     fields = [replace(series, values=1e6 * series.values).finite() for series in log.magnetometers]
     magnetometers = tuple(fields)
     currents = tuple(series.finite() for series in log.currents)
+    for one in magnetometers:
+        if len(one.values) and not np.ptp(one.values, axis=0).any():
+            raise ValueError(f"Input {one.name} must have readings that vary; instead all are equal. Leave it out.")
     start = find_start(data, magnetometers)
     layout = Layout(tuple(one.name for one in magnetometers), tuple(one.name for one in currents))
-    ranges = np.array([max(float(np.ptp(one.values)), 1e-6) for one in currents])
+    ranges = np.array([one.span for one in currents])
     sigma = layout.prior_sigma(field, ranges)
     prior = np.zeros(layout.size)
     prior[INCLINATION] = field.inclination_rad
@@ -118,7 +121,19 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
         estimate = Estimate.at(problem, estimate.parameters, estimate.knots_q, estimate.states)
     last = minimise(_Iterate(estimate), lambda _: 1e-2, damping=1e-9, max_iterations=_LAST_ITERATIONS)
     estimate = last.point.estimate
+    for m, mounting in enumerate(start.mountings):
+        _check_handed(layout.magnetometers[m], estimate.parameters[layout.matrix(m)].reshape(3, 3) @ mounting.T)
     return LogFit(estimate, _Iterate(estimate).system.solve(), start.mountings, disturbed, last.converged)
+
+
+def _check_handed(name: str, matrix: FloatArray) -> None:
+    """Refuse a magnetometer whose matrix (3, 3), by its mounting, reverses an axis."""
+    if np.linalg.det(matrix) <= 0.0:
+        axis = AXES[int(np.argmin(np.diagonal(matrix)))]
+        raise ValueError(
+            f"Input {name} must have right-handed axes; instead received readings that fit with {axis} reversed."
+            " Change the sign of that axis."
+        )
 
 
 def most_likely_noise(model: LinearModel, noise: Noise, usual: Noise) -> Noise:

@@ -11,6 +11,7 @@ from adcs.log_calibration.arrow import ArrowSystem
 from adcs.log_calibration.parameters import FORCE, GRAVITY, GYRO_BIAS, GYRO_MATRIX, INCLINATION, MODULUS
 from adcs.log_calibration.system import HEADING_RAD, Estimate, Noise, slow_field
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 _CHUNK = 50  # intervals whose derivatives are in memory at a time
 
@@ -105,8 +106,7 @@ def magnetometer_jacobian(at: Estimate, m: int, which: slice, within: FloatArray
     body, part = rows.body[which], rows.part[which, None, None]
     R = quaternion.matrix(rows.q[which])
     turned = A @ R.transpose(0, 2, 1)
-    cross = np.array([[0.0, -b[2], b[1]], [b[2], 0.0, -b[0]], [-b[1], b[0], 0.0]])
-    by_theta = turned @ cross
+    by_theta = turned @ cross_matrix(b)
     by_gyro = -by_theta @ within[rows.before[which]]
     n, unit = len(body), np.broadcast_to(np.eye(3), (len(body), 3, 3))
     by_matrix = np.einsum("ij,nk->nijk", np.eye(3), body).reshape(n, 3, 9)
@@ -150,7 +150,7 @@ def _add_force(system: ArrowSystem, at: Estimate) -> None:
     force, force_part, R = at.mean_force
     J, JP = np.zeros((K - 1, 3, 2 * n)), np.zeros((K - 1, 3, p))
     # Residual = force - prediction; J is the derivative of the prediction minus the force.
-    J[:, :, :3], J[:, :, n : n + 3] = _cross(force - force_part), _cross(force_part)
+    J[:, :, :3], J[:, :, n : n + 3] = cross_matrix(force - force_part), cross_matrix(force_part)
     per_s = np.eye(3) / data.span_s[:, None, None]
     J[:, :, 6:9], J[:, :, n + 6 : n + 9] = -per_s, per_s
     JP[:, 2, GRAVITY] = 1.0
@@ -176,10 +176,3 @@ def _add_priors(system: ArrowSystem, at: Estimate, noise: Noise) -> None:
     information = at.problem.prior_sigma**-2.0
     system.corner[np.diag_indices(p)] += information
     system.corner_gradient[:] += information * (at.problem.prior - at.parameters)
-
-
-def _cross(v: FloatArray) -> FloatArray:
-    """Return the matrices (n, 3, 3) of cross products with vectors (n, 3)."""
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

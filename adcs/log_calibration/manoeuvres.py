@@ -17,6 +17,7 @@ from adcs.log_calibration.fit import LogFit
 from adcs.log_calibration.parameters import INCLINATION, MODULUS
 from adcs.log_calibration.terms import Terms, is_throttle
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 _POINTS = 48
 _NOISE_uT = 0.3
@@ -103,14 +104,13 @@ def _information(fit: LogFit, manoeuvre: Manoeuvre) -> FloatArray:
     layout, p = at.problem.layout, at.parameters
     b, by_inclination = at.field_uT
     R = manoeuvre.rotation.as_matrix()
-    n, total = len(R), np.zeros((layout.size, layout.size))
+    n = len(R)
     current = np.broadcast_to(manoeuvre.current, (n, len(layout.currents)))
-    cross = np.array([[0.0, -b[2], b[1]], [b[2], 0.0, -b[0]], [-b[1], b[0], 0.0]])
     J = np.zeros((len(layout.magnetometers), n, 3, 3 + layout.size))
     for m in range(len(layout.magnetometers)):
         turned = p[layout.matrix(m)].reshape(3, 3) @ R.transpose(0, 2, 1)
         body = R.transpose(0, 2, 1) @ b
-        J[m, :, :, :3] = turned @ cross
+        J[m, :, :, :3] = turned @ cross_matrix(b)
         J[m, :, :, 3 + MODULUS] = turned @ b
         J[m, :, :, 3 + INCLINATION] = turned @ by_inclination
         for i in range(3):
@@ -120,5 +120,4 @@ def _information(fit: LogFit, manoeuvre: Manoeuvre) -> FloatArray:
     flat = J.reshape(-1, 3 + layout.size) / _NOISE_uT
     whole = flat.T @ flat
     whole[:3, :3] += np.diag(_COMMON_RAD**-2.0)
-    total = whole[3:, 3:] - whole[3:, :3] @ np.linalg.solve(whole[:3, :3], whole[:3, 3:])
-    return np.asarray(total)
+    return np.asarray(whole[3:, 3:] - whole[3:, :3] @ np.linalg.solve(whole[:3, :3], whole[:3, 3:]))

@@ -9,6 +9,7 @@ import numpy as np
 from adcs.complementary.inertial.gaps import sensor_gaps
 from adcs.satellite.vector_record import GyroSamples, step_rates, steps_s
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.navigation.poses import vectors_at
 
 SHORTEST_S, FEWEST_ROWS = 2.0, 10
 _KNOT_S, _MOST_KNOTS = 2.0, 1500
@@ -34,6 +35,11 @@ class Series:
     time_s: FloatArray
     values: FloatArray
     device_id: int = 0
+
+    @property
+    def span(self) -> float:
+        """Difference of the largest and the smallest value, at least 1e-6."""
+        return max(float(np.ptp(self.values)), 1e-6)
 
     def finite(self) -> Series:
         """Return the series without missing samples and without samples that are not later than the one before."""
@@ -63,8 +69,8 @@ class VehicleLog:
     Raises
     ------
     ValueError
-        The shapes do not agree, times do not ascend, a gyro or accelerometer or magnetometer is missing, or the log is
-        shorter than 2 s.
+        The shapes do not agree, times do not ascend, gyro or accelerometer have fewer than ten readings, a magnetometer
+        is missing, a unit is wrong, or the log is shorter than 2 s.
 
     Examples
     --------
@@ -87,8 +93,8 @@ class VehicleLog:
         for name, values in (("gyro_rad_s", self.gyro_rad_s), ("acceleration_m_s2", self.acceleration_m_s2)):
             if values.shape != (n, 3):
                 raise ValueError(f"Input {name} must have shape ({n}, 3); instead received {values.shape}.")
-            if np.isfinite(values).all(axis=1).sum() < 2:
-                raise ValueError(f"Input {name} must have two readings at least; instead received fewer.")
+            if (read := np.isfinite(values).all(axis=1).sum()) < FEWEST_ROWS:
+                raise ValueError(f"Input {name} must have {FEWEST_ROWS} readings at least; instead received {read}.")
         steps_s(self.time_s)
         if np.ptp(self.time_s) < SHORTEST_S:
             raise ValueError(
@@ -150,7 +156,7 @@ class InertialData:
         dt = steps_s(times)
         rate = step_rates(gyro, dt, log.gyro_samples)
         known = np.asarray(np.isfinite(force).all(axis=1))
-        whole = np.stack([np.interp(times, times[known], axis[known]) for axis in force.T], axis=1)
+        whole = vectors_at(times, times[known], force[known])
         length = max(_KNOT_S, np.ptp(times) / _MOST_KNOTS)
         at = times[0] + length * np.arange(1, int(np.ptp(times) / length))
         knots = np.unique(np.concatenate([[0], np.searchsorted(times, at), [len(times) - 1]]))

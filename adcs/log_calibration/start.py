@@ -64,17 +64,17 @@ def find_start(data: InertialData, magnetometers: tuple[Series, ...]) -> Start:
     """Return a start from the level attitude and the mounting and heading rate that fit each magnetometer best."""
     bias = _quiet_bias(data)
     q = _level(data, bias)
-    found = [_fit_mounting(data, q, series) for series in magnetometers]
+    samples = [_sampled(data, series) for series in magnetometers]
+    found = [_fit_mounting(data.time_s, q, *each) for each in samples]
     best = min(found, key=lambda fit: fit.misfit)
     turned = _rotate_heading(data.time_s, q, best.heading_rate)
-    solved = [_solve(data, turned, series, fit) for series, fit in zip(magnetometers, found, strict=True)]
+    solved = [_solve(turned, *each, fit.mounting) for each, fit in zip(samples, found, strict=True)]
     field = solved[found.index(best)][:3]
     east = math.atan2(field[0], field[1])
-    spin = np.array([math.cos(0.5 * east), 0.0, 0.0, math.sin(0.5 * east)])
     offsets = [fit.mounting @ x[3:] for fit, x in zip(found, solved, strict=True)]
     R_bias = quaternion.rotate_back(turned, np.array([0.0, 0.0, best.heading_rate])).mean(axis=0)
     return Start(
-        quaternion.multiply(spin, turned),
+        quaternion.multiply(quaternion.exp([0.0, 0.0, east]), turned),
         bias + R_bias,
         np.array([fit.mounting for fit in found]),
         np.array(offsets),
@@ -116,9 +116,8 @@ def _level(data: InertialData, bias: FloatArray) -> FloatArray:
 
 def _rotate_heading(time_s: FloatArray, q: FloatArray, rate_rad_s: float) -> FloatArray:
     """Return attitudes without a constant rate about the vertical."""
-    half = -0.5 * rate_rad_s * (time_s - time_s[0])
-    zero = np.zeros_like(half)
-    return quaternion.multiply(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1), q)
+    turn = np.outer(time_s - time_s[0], [0.0, 0.0, -rate_rad_s])
+    return quaternion.multiply(quaternion.exp(turn), q)
 
 
 def _sampled(data: InertialData, series: Series) -> tuple[IntArray, FloatArray]:
@@ -145,17 +144,16 @@ def _design(q: FloatArray) -> FloatArray:
     return np.concatenate([R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape)], axis=2)
 
 
-def _fit_mounting(data: InertialData, q: FloatArray, series: Series) -> _Mounting:
+def _fit_mounting(time_s: FloatArray, q: FloatArray, at: IntArray, readings: FloatArray) -> _Mounting:
     """Return the mounting and the rate of the heading with the least residuals."""
-    at, readings = _sampled(data, series)
     choices = mountings()
     y = np.einsum("qji,nj->niq", choices, readings).reshape(-1, len(choices))
-    length = float(np.ptp(data.time_s[at]))
+    length = min(float(np.ptp(time_s[at])), _WINDOW_S)  # a gap may follow the last reading
     steps = max(1, math.ceil(_LARGEST_BIAS_RAD_S * length / 2.0 / _PHASE_RAD))
     rates = _LARGEST_BIAS_RAD_S * np.arange(-steps, steps + 1) / steps
     squares = np.empty((len(rates), len(choices)))
     for i, rate in enumerate(rates):
-        X = _design(_rotate_heading(data.time_s[at], q[at], rate)).reshape(-1, 6)
+        X = _design(_rotate_heading(time_s[at], q[at], rate)).reshape(-1, 6)
         basis = np.linalg.svd(X, full_matrices=False)
         known = basis.U[:, basis.S / basis.S[0] > 1e-3]
         squares[i] = np.sum((y - known @ (known.T @ y)) ** 2, axis=0)
@@ -167,10 +165,9 @@ def _fit_mounting(data: InertialData, q: FloatArray, series: Series) -> _Mountin
     return _Mounting(choices[best], float(rates[np.argmin(squares[:, best])]), float(rms[best]))
 
 
-def _solve(data: InertialData, q: FloatArray, series: Series, fit: _Mounting) -> FloatArray:
+def _solve(q: FloatArray, at: IntArray, readings: FloatArray, mounting: FloatArray) -> FloatArray:
     """Return the field in the world frame and the offset in body axes (6,)."""
-    at, readings = _sampled(data, series)
     X = _design(q[at]).reshape(-1, 6)
     # Of equal fits the one with the smaller offset.
     weight = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4]) * len(at)
-    return np.asarray(np.linalg.solve(X.T @ X + weight, X.T @ (readings @ fit.mounting).ravel()))
+    return np.asarray(np.linalg.solve(X.T @ X + weight, X.T @ (readings @ mounting).ravel()))

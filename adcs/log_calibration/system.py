@@ -35,6 +35,7 @@ from adcs.log_calibration.parameters import (
 )
 from adcs.log_calibration.record import InertialData, Series
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.navigation.poses import vectors_at
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 _FORCE_NOISE_M_S2 = 0.03
@@ -199,7 +200,7 @@ class Estimate:
         matrix = np.zeros((3, 3))
         i, j = SYMMETRIC.T
         matrix[i, j] = matrix[j, i] = parameters[GYRO_MATRIX]
-        drift = np.stack([np.interp(data.time_s, data.time_s[knots], axis) for axis in states[:, DRIFT].T], axis=1)
+        drift = vectors_at(data.time_s, data.time_s[knots], states[:, DRIFT])
         rate = (data.rate_rad_s - parameters[GYRO_BIAS] - drift) @ (np.eye(3) - matrix).T
         q_gyro = gyro_attitudes(rate, data.dt_s)
         from_gyro = quaternion.multiply(knots_q, quaternion.conjugate(q_gyro[knots]))

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from adcs.log_calibration.record import Series, VehicleLog
 from arrays.typing import FloatArray, Rng
+from sims.noise import lasting
 
 _GRAVITY, _DRAG = 9.80665, 0.3
 _FIELD_T = (0.0, 20.9e-6, -43.0e-6)
@@ -111,11 +112,11 @@ class _Path:
         self._size = rng.uniform(0.5, 1.5, (3, 7)) / self._rate * np.array([[1.0], [1.0], [0.6]])
         self._settings = settings
         self._scale = 1.0
+        self._turns: list[tuple[float, float, float]] = []
         times = np.arange(0.0, settings.duration_s, 0.1)
         for _ in range(20):
             tilt = self.rotation(times).apply([0.0, 0.0, 1.0])[:, 2].min()
             self._scale *= math.tan(math.radians(settings.tilt_deg)) / math.tan(math.acos(tilt))
-        self._turns = []
         start = 0.0
         while settings.turns and start < settings.duration_s:
             start += rng.uniform(3.0, 15.0)
@@ -138,7 +139,7 @@ class _Path:
         up = self.forces(time_s)[1]
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         yaw = np.full(len(time_s), 0.4)
-        for start, length, angle in getattr(self, "_turns", ()):
+        for start, length, angle in self._turns:
             part = np.clip((time_s - start) / length, 0.0, 1.0)
             yaw += angle * part**2 * (3.0 - 2.0 * part)
         ahead = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
@@ -206,9 +207,6 @@ def _symmetric(rng: np.random.Generator, n: int, sigma: float) -> FloatArray:
 
 def _slow(rng: np.random.Generator, time_s: FloatArray, sigma: float, correlation_s: float) -> FloatArray:
     """Return three components of a stationary exponentially correlated process."""
-    from scipy.signal import lfilter
-
-    part = math.exp(-float(np.median(np.diff(time_s))) / correlation_s)
-    white = rng.normal(0.0, sigma * math.sqrt(1.0 - part**2), (len(time_s), 3))
-    white[0] = rng.normal(0.0, sigma, 3)
-    return np.asarray(lfilter([1.0], [1.0, -part], white, axis=0))
+    white = rng.standard_normal((len(time_s), 3))
+    white[0] = rng.standard_normal(3)
+    return sigma * lasting(white, correlation_s, 1.0 / float(np.median(np.diff(time_s))))

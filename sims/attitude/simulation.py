@@ -17,7 +17,7 @@ from scipy import signal
 
 from adcs import quaternion
 from adcs.environment.environment import Environment, environment
-from adcs.environment.orbit import EARTH_RADIUS_M
+from adcs.environment.sun import earth_radius_rad
 from adcs.frames import turned
 from adcs.satellite import dynamics, sensors
 from adcs.satellite.attitude_track import AttitudeTrack
@@ -219,7 +219,7 @@ def sense(prepared: PreparedRuns, q: FloatArray, w: FloatArray, rows: slice = sl
     """
     satellite, around = prepared.scenario.satellite, prepared.environment
     sun_orbital, lit = around.sun_orbital[:, rows], around.illuminated[:, rows]
-    earth_radius = np.arcsin(np.minimum(1.0, EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1)))
+    earth_radius = earth_radius_rad(around.position_eci_m[:, rows])
     b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
     b_body = b_body + turned(prepared.field_gain[:, None], b_body)
     noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}

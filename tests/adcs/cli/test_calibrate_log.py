@@ -60,12 +60,22 @@ def test_without_a_place_the_scale_is_listed(adcs, log, tmp_path):
     assert "COMPASS_DIA_X" not in (tmp_path / "mag.parm").read_text()
 
 
+def test_array_file_of_two_magnetometers_is_refused(adcs, tmp_path):
+    flight = simulate_flight(31, FlightSettings(duration_s=20.0, inertial_Hz=50.0, magnetometers=2))
+    write_flight(flight, tmp_path / "two.csv")
+    assert_refused(
+        adcs("calibrate-log", tmp_path / "two.csv", "--out", tmp_path / "mag.toml"), "2 magnetometers, whose"
+    )
+    assert not (tmp_path / "mag.toml").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (("--out", "mag.csv"), "expected a name that ends in"),
         (("--out", "mag.toml", "--place", "48", "11", "500"), "expected --date with it"),
         (("--out", "mag.toml", "--place", "48", "11", "500", "--date", "May"), "found 'May'"),
+        (("--out", "mag.toml", "--place", "95", "11", "500", "--date", "2026-05-01"), "--place: latitude_deg must lie"),
         (("--out", "mag.toml", "--currents", "amps"), "column amps: found no such column"),
     ],
 )

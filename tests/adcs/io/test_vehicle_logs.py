@@ -1,5 +1,7 @@
 """Logs of vehicles: CSV files, and binary logs of autopilots."""
 
+import os
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +30,23 @@ CALIBRATED = {
 }
 
 
-def px4_log(path, *, magnetometer="sensor_mag", parameters=None):
+LAYOUT = """
+format_version = 1
+[log]
+time = "utc"
+time_format = "utc"
+[log.gyro]
+columns = ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"]
+unit = "rad/s"
+[log.accelerometer]
+[log.magnetometer]
+columns = ["mast_x_nT", "mast_y_nT", "mast_z_nT"]
+unit = "nT"
+"""
+
+
+def px4_log(path, *, magnetometer="sensor_mag", parameters=None, log=FLIGHT.log):
     """Write a flight as PX4 logs it; places in 1e-7 degrees."""
-    log = FLIGHT.log
     stamp = (1e6 * log.time_s + 5e6).astype("u8")
     topics = [
         (
@@ -90,6 +106,29 @@ class TestText:
         assert [one.name for one in file.log.magnetometers] == ["field"]
         assert file.warnings == ("mag1 has no readings that vary, and is left out",)
 
+    def test_text_and_utc_columns_by_a_layout(self, tmp_path):
+        """A magnetometer that the layout names is read once; cells of other columns may hold anything."""
+        write_flight(FLIGHT, tmp_path / "log.csv")
+        header, *rows = (tmp_path / "log.csv").read_text().splitlines()
+        utc = np.datetime64("2026-05-12T10:00:00", "ms") + np.arange(len(rows)) * np.timedelta64(10, "ms")
+        cells = [",".join([str(at), "STABILIZE", *row.split(",")[1:]]) for at, row in zip(utc, rows, strict=True)]
+        header = header.replace("time_s", "utc,mode").replace("field_", "mast_")
+        (tmp_path / "utc.csv").write_text("\n".join([header, *cells]))
+        (tmp_path / "layout.toml").write_text(LAYOUT)
+        file = adcs.read_vehicle(tmp_path / "utc.csv", tmp_path / "layout.toml")
+        assert [one.name for one in file.log.magnetometers] == ["field", "mag1"]
+        assert [one.name for one in file.log.currents] == ["battery_A"]
+        np.testing.assert_allclose(np.diff(file.log.time_s), 0.01, atol=1e-6)
+
+    def test_pipe(self, tmp_path):
+        write_flight(FLIGHT, tmp_path / "log.csv")
+        os.mkfifo(tmp_path / "pipe")
+        writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=[(tmp_path / "log.csv").read_bytes()])
+        writer.start()
+        file = adcs.read_vehicle(tmp_path / "pipe")
+        writer.join()
+        assert [one.name for one in file.log.magnetometers] == ["field", "mag1"]
+
     def test_named_current_that_is_missing(self, tmp_path):
         write_flight(FLIGHT, tmp_path / "log.csv")
         with pytest.raises(arrays.InputError, match=r"the nearest is battery_A"):
@@ -136,6 +175,13 @@ class TestPx4:
         file = adcs.read_vehicle(px4_log(tmp_path / "log.ulg", magnetometer="vehicle_magnetometer"))
         assert file.is_corrected
         assert "adds to its parameters" in file.warnings[0]
+
+    def test_magnetometer_that_is_disabled(self, tmp_path):
+        still = replace(FLIGHT.log.magnetometers[1], values=np.full_like(FLIGHT.log.magnetometers[1].values, 1e-5))
+        log = replace(FLIGHT.log, magnetometers=(FLIGHT.log.magnetometers[0], still))
+        file = adcs.read_vehicle(px4_log(tmp_path / "log.ulg", log=log))
+        assert [one.name for one in file.log.magnetometers] == ["sensor_mag"]
+        assert "sensor_mag[1].x stands at" in file.warnings[0]
 
     def test_no_magnetometer(self, tmp_path):
         with pytest.raises(arrays.InputError, match="found no readings of a magnetometer"):

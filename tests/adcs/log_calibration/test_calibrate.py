@@ -152,6 +152,41 @@ class TestFaults:
         error, covariance = parameter_errors(flight, found)
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
 
+    def test_accelerometer_that_points_down_at_rest(self):
+        """Tilt and inclination contradict each other: the noise takes all of it, and a flag states it."""
+        log = simulate_flight(1, replace(SHORT, duration_s=30.0)).log
+        found = adcs.calibrate_log(replace(log, acceleration_m_s2=-log.acceleration_m_s2), field_T=FIELD_T)
+        assert any("contradicts gyro and accelerometer" in flag for flag in found.flags)
+
+    @pytest.mark.parametrize("axis", range(3))
+    def test_reversed_axis(self, axis):
+        """The fit finds a left-handed matrix, or a rotation that contradicts the gyro: no advice on the mounting."""
+        log = simulate_flight(1, replace(SHORT, duration_s=30.0)).log
+        mag = log.magnetometers[0]
+        values = mag.values * np.where(np.arange(3) == axis, -1.0, 1.0)
+        try:
+            found = adcs.calibrate_log(replace(log, magnetometers=(replace(mag, values=values),)), field_T=FIELD_T)
+        except ValueError as error:
+            assert f"fit with {'xyz'[axis]} reversed" in str(error)
+        else:
+            assert any("check signs, axes" in flag for flag in found.flags)
+            assert not any("ROT" in flag for flag in found.flags)
+
+    def test_equal_readings(self):
+        log = simulate_flight(1, replace(SHORT, duration_s=30.0)).log
+        mag = log.magnetometers[0]
+        with pytest.raises(ValueError, match="readings that vary"):
+            adcs.calibrate_log(
+                replace(log, magnetometers=(replace(mag, values=np.full_like(mag.values, 1e-5)),)), field_T=FIELD_T
+            )
+
+    def test_clock_that_jumps_by_months(self):
+        """All readings of the magnetometer are before the jump or in the gap."""
+        log = simulate_flight(1, replace(SHORT, duration_s=30.0)).log
+        later = np.where(log.time_s > 20.0, log.time_s + 1e7, log.time_s)
+        with pytest.raises(ValueError, match="outside gaps of the gyro"):
+            adcs.calibrate_log(replace(log, time_s=later), field_T=FIELD_T)
+
     @pytest.mark.parametrize(
         ("change", "words"),
         [
