@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from adcs.log_calibration.fit import LogFit, fit_log
 from adcs.log_calibration.manoeuvres import PLACE, advice
 from adcs.log_calibration.parameters import FieldPrior
-from adcs.log_calibration.record import VehicleLog
+from adcs.log_calibration.record import Series, VehicleLog
 from adcs.log_calibration.rotations import nearest_rotation
 from adcs.log_calibration.terms import Terms, soft_iron, terms_of
 from arrays.array import SensorArray
@@ -82,12 +82,17 @@ class LogCalibration(Drawn):
         """Return the fields (J, 3) of the unit of each current at a magnetometer."""
         return 1e-6 * self.fit.estimate.parameters[self.fit.estimate.problem.layout.current(m)].reshape(-1, 3)
 
+    def corrected(self, m: int) -> Series:
+        """Return a magnetometer's calibrated readings [T] in body axes, at the times of the motion: without its lag."""
+        rows = self.fit.estimate.sensor_rows(m, all_rows=True)
+        series = self.fit.estimate.problem.magnetometers[m]
+        raw = 1e-6 * series.values[rows.which] - self.offset_T(m) - rows.current @ self.current_T(m)
+        lag_s = float(self.fit.estimate.parameters[self.fit.estimate.problem.layout.lag(m)])
+        return replace(series, time_s=series.time_s[rows.which] - lag_s, values=raw @ np.linalg.inv(self.matrix(m)).T)
+
     def corrected_T(self, m: int) -> FloatArray:
         """Return the calibrated readings (n, 3) of a magnetometer during the inertial readings, body axes."""
-        rows = self.fit.estimate.sensor_rows(m, all_rows=True)
-        raw = 1e-6 * self.fit.estimate.problem.magnetometers[m].values[rows.which]
-        raw = raw - self.offset_T(m) - rows.current @ self.current_T(m)
-        return np.asarray(raw @ np.linalg.inv(self.matrix(m)).T)
+        return self.corrected(m).values
 
     def array(self) -> SensorArray:
         """Return the magnetometer as an array in body axes, with its calibration.

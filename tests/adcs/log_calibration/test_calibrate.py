@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
 import adcs
@@ -51,6 +51,16 @@ class TestErrorsAndTheirCovariance:
         assert np.median(np.abs(irons)) < 0.003
         assert np.median(np.abs(currents)) < 0.03 * 50e-9
         assert np.median(np.abs(lags)) < 0.003
+
+
+class TestCorrectedReadings:
+    def test_field_in_true_body_axes(self):
+        """Turned into the world by the true attitude at their own times, the readings are the Earth's field."""
+        flight, found = calibrated(7, SHORT)
+        series = found.corrected(0)
+        attitude = Slerp(flight.log.time_s, flight.rotation)(series.time_s)
+        error_T = attitude.apply(series.values) - FIELD_T
+        assert np.sqrt(np.mean(error_T**2)) < 3.0 * FlightSettings().noise_T
 
 
 class TestUndetermined:
