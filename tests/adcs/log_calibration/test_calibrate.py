@@ -103,6 +103,7 @@ class TestUndetermined:
 
 
 class TestMounting:
+    @pytest.mark.slow_after(2)
     @pytest.mark.parametrize(
         ("angles", "word"),
         [

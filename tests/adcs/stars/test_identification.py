@@ -80,11 +80,12 @@ class TestRandomSky:
             points, magnitudes, _ = image_of(other, R, rng)
             assert isinstance(matcher.identify(points, magnitudes), NoFix)
 
-    def test_a_mirrored_image_is_named(self):
+    @pytest.mark.parametrize("n", [1, pytest.param(4, marks=pytest.mark.slow)])
+    def test_a_mirrored_image_is_named(self, n):
         """The matcher alone finds nothing; among images each is tried both ways."""
         sky, rng = random_sky(30_000), np.random.default_rng(6)
         matcher = StarMatcher.of(sky, CAMERA)
-        for R in Rotation.random(4, random_state=7).as_matrix():
+        for R in Rotation.random(n, random_state=7).as_matrix():
             points, magnitudes, _ = image_of(sky, R, rng)
             mirrored = points * [-1.0, 1.0] + [1392.0, 0.0]
             assert isinstance(matcher.identify(mirrored, magnitudes), NoFix)
