@@ -414,6 +414,16 @@ class TestCommand:
     def test_no_such_folder(self, adcs, sky_files, tmp_path):
         assert_refused(adcs("stars", tmp_path / "none", "--catalogue", sky_files / "sky.csv"), "does not exist")
 
+    @pytest.mark.parametrize(("options", "scale"), [((), 0.0), (("--scale-tolerance", "0.02"), 0.02)])
+    def test_the_tolerance_is_the_error_of_the_scale(self, adcs, sky_files, monkeypatch, options, scale):
+        def identify(*_, lens, **others):
+            assert lens.scale == scale
+            assert (lens.bent > 0.0) == (scale > 0.0)
+            raise InputError("seen")
+
+        monkeypatch.setattr("adcs.identify_stars", identify)
+        assert_refused(adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", *options), "seen")
+
     def test_noise_must_be_positive(self, adcs, sky_files):
         outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "0")
         assert_refused(outcome, "--noise-px", "expected a positive number")

@@ -53,6 +53,7 @@ def mean_nees(seeds: range, n: int) -> float:
         track = magloc.track(board(gain_uncertainty=GAIN), readings, motion=MOTION)
         assert track.tracked.all()
         assert not track.innovations.flagged
+        assert np.isfinite([point.lag1 for point in track][2:]).all()
         covariance = np.array([point.covariance for point in track])
         error = np.concatenate([track.position_m, track.moment_Am2], axis=1) - states
         found.append(normalised_square(error, covariance)[n // 2 :].mean() / 6.0)
