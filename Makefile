@@ -20,9 +20,9 @@ KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 map: .venv/installed
 	$(BIN)/magloc map
 
-# Three at once also on two processors: some wait for commands, servers and pages.
+# Two at once: each of them imports and collects all tests, which takes 12 s of processor.
 test: ready chromium
-	$(BIN)/python -m pytest -q -n 3 -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
 
 test-full: ready chromium
 	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 3

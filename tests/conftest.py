@@ -9,6 +9,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,22 +55,23 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     cached yet no two processes compile the same ones.
     """
 
-    def rank(item: pytest.Item) -> int:
-        if "browser" in item.path.parts or item.path.stem == "test_scenario_consistency":
+    @cache
+    def rank(path: Path) -> int:
+        if "browser" in path.parts or path.stem == "test_scenario_consistency":
             return 0
-        if item.path.is_relative_to(REPOSITORY / "tests" / "adcs"):
+        if path.is_relative_to(REPOSITORY / "tests" / "adcs"):
             return 1
-        return 2 if item.path.suffix == ".ipynb" or item.path.stem == "test_guide" else 3
+        return 2 if path.suffix == ".ipynb" or path.stem == "test_guide" else 3
 
     seen: Counter[str] = Counter()
     for item in items:
         kept = item.get_closest_marker("slow_after")
         test = item.nodeid.partition("[")[0]
         seen[test] += 1
-        longer_notebook = item.path.suffix == ".ipynb" and item.path.stem not in QUICK_NOTEBOOKS
+        longer_notebook = ".ipynb" in test and item.path.stem not in QUICK_NOTEBOOKS
         if longer_notebook or (kept is not None and seen[test] > kept.args[0]):
             item.add_marker(pytest.mark.slow)
-    items.sort(key=rank)
+    items.sort(key=lambda item: rank(item.path))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -79,7 +81,6 @@ def pytest_collection() -> Generator[None, object, object]:
     try:
         return (yield)
     finally:
-        gc.collect()
         gc.freeze()
         gc.enable()
 

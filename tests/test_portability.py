@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -168,13 +169,18 @@ RULES: dict[str, tuple[Callable[[ast.Module], Iterator[ast.AST]], list[str], lis
 }
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 @pytest.mark.parametrize("rule", RULES)
 class TestRules:
     def test_hold(self, rule: str) -> None:
         found = [
             f"{path.relative_to(REPOSITORY).as_posix()}:{node.lineno}: {ast.unparse(node)[:80]}"
             for path in FILES
-            for node in RULES[rule][0](ast.parse(path.read_text(encoding="utf-8")))
+            for node in RULES[rule][0](tree_of(path))
         ]
         assert found == []
 

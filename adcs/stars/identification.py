@@ -101,7 +101,7 @@ class StarMatcher:
     near: SkyCap
     camera: StarCamera
     index: TriangleIndex
-    noise_px: float = 1.0
+    noise_px: float
     most_chance: float = 1e-6
 
     @classmethod

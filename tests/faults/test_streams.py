@@ -14,6 +14,8 @@ from tests.fuzz.cases import LINES, MAINS, SELDOM, STREAM
 
 FULL = Path("/dev/full")
 COMMANDS = [pytest.param(name, marks=[pytest.mark.slow] if name in SELDOM else []) for name in LINES]
+# In `make test` a full standard output is met by a command of each kind of output: text, JSON, lines, rows, nothing.
+QUICK = {"adcs estimate", "adcs imu", "adcs run", "magloc columns", "magloc live", "magloc locate", "magloc new-array"}
 PRINTING_NOTHING = {"magloc new-array", "magloc view", "adcs view"}
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 
@@ -34,7 +36,9 @@ def run(command, words, stdout):
 
 
 @needs_full
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    "command", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in LINES]
+)
 def test_full_standard_output(command, folder):
     with FULL.open("w") as full:
         status, err = run(command, LINES[command][0].split(), full)

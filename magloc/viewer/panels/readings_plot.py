@@ -141,7 +141,8 @@ class ReadingsPlot:
 
     def _set_readings(self, readings: Readings, residuals_T: FloatArray | None) -> None:
         self._order = np.argsort(readings.time_s, kind="stable")
-        self._time_s = readings.time_s[self._order] - readings.time_s[self._order[0 if self._window_s is None else -1]]
+        origin = 0 if self._window_s is None else -1
+        self._time_s = readings.time_s[self._order] - readings.time_s[self._order[origin]]
         self._rank = np.argsort(self._order)
         self._values_T = readings.values_T[self._order]
         self._residuals_T = None if residuals_T is None else residuals_T[self._order]

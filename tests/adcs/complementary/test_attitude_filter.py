@@ -298,7 +298,7 @@ def random_updates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if COMPILER is None:
         pytest.skip("no C++ compiler")
     program = tmp_path_factory.mktemp("random") / "random_updates"
-    command = [COMPILER, "-std=c++17", "-O1", f"-I{core.include_dir()}", "-Wall", "-Wextra", "-Werror"]
+    command = [COMPILER, "-std=c++17", "-O0", f"-I{core.include_dir()}", "-Wall", "-Wextra", "-Werror"]
     source = [str(Path(__file__).with_name("random_updates.cpp")), "-o", str(program)]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     if subprocess.run([*command, *sanitizers, *source], check=False, capture_output=True).returncode:

@@ -87,9 +87,16 @@ class TestError:
 
 
 class TestTwins:
-    @pytest.mark.parametrize("rule", RULES)
-    @pytest.mark.parametrize("missing", [(), [("second", 25, 45)], [("second", 0, 60)], [("first", 10, 20)]])
-    @pytest.mark.parametrize("method", ["explicit", "gauss-newton"])
+    @pytest.mark.parametrize(
+        ("rule", "missing", "method"),
+        [
+            # In `make test` each two of these come together.
+            pytest.param(rule, missing, method, marks=[pytest.mark.slow] if (i + j + k) % 2 else [])
+            for i, rule in enumerate(RULES)
+            for j, missing in enumerate([(), [("second", 25, 45)], [("second", 0, 60)], [("first", 10, 20)]])
+            for k, method in enumerate(["explicit", "gauss-newton"])
+        ],
+    )
     def test_agree(self, method, missing, rule, instruction_sets):
         record = short_record(missing=missing)
         gains = Gains(0.1, 1e-3, 0.05, 1e-4, boost=3.0, boost_level_rad=0.4, boost_memory=0.8)

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,14 @@ SCENARIO = replace(tabletsat(240.0), gyro_bias_rad_s=GYRO_BIAS_RAD_S, conditions
 SATELLITE = SCENARIO.satellite
 
 
+@cache
+def simulated() -> adcs.Telemetry:
+    return adcs.Telemetry.of(sims.simulate(SCENARIO, 3), SATELLITE.start)
+
+
 def log_of(rows: Array | slice = slice(None), shift_s: Array | float = 0.0, **changes: Array) -> adcs.Telemetry:
     """Rows of a simulated log with wild readings, missing readings, commands and the covariance of some fixes."""
-    whole = adcs.Telemetry.of(sims.simulate(SCENARIO, 3), SATELLITE.start)
+    whole = simulated()
     n, rng = len(whole.time_s), np.random.default_rng(4)
     values: dict[str, Any] = {name: np.array(getattr(whole, name)) for name in READINGS}
     for name in READINGS[:4]:
@@ -97,7 +103,11 @@ SETS = [
 
 @pytest.mark.usefixtures("_exact_environment")
 class TestAsTheBatch:
-    @pytest.mark.parametrize(("sensors", "states"), SETS)
+    @pytest.mark.parametrize(
+        ("sensors", "states"),
+        # In `make test` the other sets are tried at any times.
+        [pytest.param(*one, marks=[pytest.mark.slow] if one in SETS[:2] else []) for one in SETS],
+    )
     def test_with_missing_and_wild_readings(self, sensors: str, states: tuple[str, ...]) -> None:
         log = log_of()
         batch = adcs.estimate(log, SATELLITE, sensors=sensors, states=states)
@@ -148,16 +158,27 @@ def test_with_the_interpolated_field_of_the_batch() -> None:
     assert max(apart) < 1e-6
 
 
+BEGINS = (0, 1, 40, 80)
+
+
+@cache
+def whole_run() -> tuple[list[SatelliteEstimate], dict[int, dict[str, Any]]]:
+    """Return the estimates of 100 rows, and the states before some of them."""
+    log, filter_ = log_of(slice(100)), filter_of(*SETS[1])
+    states, found = {}, []
+    for begin, end in zip(BEGINS, (*BEGINS[1:], 100), strict=True):
+        states[begin] = filter_.state()
+        found += updates(filter_, log, range(begin, end))
+    return found, states
+
+
 class TestState:
-    @pytest.mark.parametrize("begin", [0, 1, 40, 150])
+    @pytest.mark.parametrize("begin", BEGINS)
     def test_resumes_bit_for_bit(self, begin: int) -> None:
         """Through a JSON file."""
-        log, (sensors, states) = log_of(slice(200)), SETS[1]
-        whole = updates(filter_of(sensors, states), log)
-        first = filter_of(sensors, states)
-        updates(first, log, range(begin))
-        resumed = adcs.SatelliteFilter.from_state(json.loads(json.dumps(first.state())), SATELLITE)
-        for one, other in zip(updates(resumed, log, range(begin, 200)), whole[begin:], strict=True):
+        whole, states = whole_run()
+        resumed = adcs.SatelliteFilter.from_state(json.loads(json.dumps(states[begin])), SATELLITE)
+        for one, other in zip(updates(resumed, log_of(slice(100)), range(begin, 100)), whole[begin:], strict=True):
             assert one.flags == other.flags
             for name in ("q", "rate_rad_s", "covariance"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
@@ -178,6 +199,16 @@ class TestState:
                 adcs.SatelliteFilter.from_state({**state, **change}, SATELLITE)
 
 
+@cache
+def used_state() -> dict[str, Any]:
+    """Return the state of a filter without a gate, so that it uses wild readings, after 50 rows."""
+    chosen = adcs.EstimatorSettings.of("st+gyro+mag+sun")
+    chosen = replace(chosen, settings=replace(chosen.settings, gate=0.0))
+    filter_ = adcs.SatelliteFilter(SATELLITE, sensors=chosen, step_s=1.0)
+    updates(filter_, log_of(slice(50)))
+    return filter_.state()
+
+
 class TestInput:
     @pytest.mark.parametrize(
         ("step_s", "readings", "words"),
@@ -195,13 +226,10 @@ class TestInput:
         ],
     )
     def test_a_refused_update_changes_nothing(self, step_s: float, readings: dict[str, Any], words: str) -> None:
-        chosen = adcs.EstimatorSettings.of("st+gyro+mag+sun")
-        chosen = replace(chosen, settings=replace(chosen.settings, gate=0.0))  # so that a wild reading is used
-        log, filter_ = log_of(slice(60)), adcs.SatelliteFilter(SATELLITE, sensors=chosen, step_s=1.0)
-        updates(filter_, log, range(50))
+        filter_ = adcs.SatelliteFilter.from_state(used_state(), SATELLITE)
         before = filter_.state()
         with np.errstate(all="ignore"), pytest.raises(ValueError, match=words):
-            filter_.update(log.time_s[49] + step_s, **readings)
+            filter_.update(simulated().time_s[49] + step_s, **readings)
         assert filter_.state() == before
 
     def test_a_silent_sensor_has_a_flag(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from sims.attitude.flights import Flight, FlightSettings, simulate_flight
 FIELD_T = np.array(FlightSettings().field_T)
 
 
+@cache
 def calibrated(seed: int, settings: FlightSettings) -> tuple[Flight, adcs.LogCalibration]:
     """Return a flight and its calibration by a model of the field that is wrong as stated."""
     flight = simulate_flight(seed, settings)

@@ -66,7 +66,10 @@ def test_array_file(calibration, readings, tmp_path):
     writer_of(tmp_path / "mag.toml")(calibration[1], tmp_path / "mag.toml")
     flight = calibration[0]
     without_current = readings[1] - CURRENT_A * flight.current_T_A[0]
-    field_T = arrays.read_array(tmp_path / "mag.toml").calibrated_field(without_current)[:, 0]
+    array = arrays.read_array(tmp_path / "mag.toml")
+    assert array.common_field_T is not None
+    assert 67e-6 < array.common_field_T < 75e-6  # the Earth's field is 67 µT at most
+    field_T = array.calibrated_field(without_current)[:, 0]
     np.testing.assert_allclose(field_T, readings[0], atol=600e-9)
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import sqrtm
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
@@ -114,6 +115,7 @@ class TestUndetermined:
 
 
 class TestMounting:
+    @pytest.mark.slow_after(2)
     @pytest.mark.parametrize(
         ("angles", "word"),
         [
@@ -246,6 +248,17 @@ class TestFaults:
         late = replace(log.magnetometers[0], time_s=log.magnetometers[0].time_s + 1e4)
         with pytest.raises(ValueError, match="ten readings during"):
             adcs.calibrate_log(replace(log, magnetometers=(late,)))
+
+
+def test_soft_iron_is_the_symmetric_factor_of_the_matrix():
+    """Of trace 3; the oracle is SciPy's root of the matrix times its transpose."""
+    _, found = calibrated(7, SHORT)
+    root = sqrtm(found.matrix(0) @ found.matrix(0).T)
+    values = {entry["name"]: entry["value"] for entry in found.entries}
+    for i, one in enumerate("xyz"):
+        for j, other in enumerate("xyz"[i:], i):
+            expected = 3.0 * root[i, j] / np.trace(root)
+            assert values[f"mag0 soft iron {one}{other}"] == pytest.approx(expected, abs=1e-9)
 
 
 def test_sigma_of_terms_is_that_of_drawn_parameters():

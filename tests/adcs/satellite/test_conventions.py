@@ -49,6 +49,7 @@ class TestMangled:
             adcs.estimate(changed(log, **MANGLED[name](log)), satellite, sensors=SENSORS)
         assert name in str(refused.value)
 
+    @pytest.mark.slow_after(4)
     @pytest.mark.parametrize("name", [name for name in MANGLED if "star" not in name])
     def test_is_named_without_a_star_tracker(self, flight, name):
         log, satellite = flight

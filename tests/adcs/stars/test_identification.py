@@ -80,11 +80,12 @@ class TestRandomSky:
             points, magnitudes, _ = image_of(other, R, rng)
             assert isinstance(matcher.identify(points, magnitudes), NoFix)
 
-    def test_a_mirrored_image_is_named(self):
+    @pytest.mark.parametrize("n", [1, pytest.param(4, marks=pytest.mark.slow)])
+    def test_a_mirrored_image_is_named(self, n):
         """The matcher alone finds nothing; among images each is tried both ways."""
         sky, rng = random_sky(30_000), np.random.default_rng(6)
         matcher = StarMatcher.of(sky, CAMERA)
-        for R in Rotation.random(4, random_state=7).as_matrix():
+        for R in Rotation.random(n, random_state=7).as_matrix():
             points, magnitudes, _ = image_of(sky, R, rng)
             mirrored = points * [-1.0, 1.0] + [1392.0, 0.0]
             assert isinstance(matcher.identify(mirrored, magnitudes), NoFix)
@@ -412,6 +413,16 @@ class TestCommand:
 
     def test_no_such_folder(self, adcs, sky_files, tmp_path):
         assert_refused(adcs("stars", tmp_path / "none", "--catalogue", sky_files / "sky.csv"), "does not exist")
+
+    @pytest.mark.parametrize(("options", "scale"), [((), 0.0), (("--scale-tolerance", "0.02"), 0.02)])
+    def test_the_tolerance_is_the_error_of_the_scale(self, adcs, sky_files, monkeypatch, options, scale):
+        def identify(*_, lens, **others):
+            assert lens.scale == scale
+            assert (lens.bent > 0.0) == (scale > 0.0)
+            raise InputError("seen")
+
+        monkeypatch.setattr("adcs.identify_stars", identify)
+        assert_refused(adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", *options), "seen")
 
     def test_noise_must_be_positive(self, adcs, sky_files):
         outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "0")

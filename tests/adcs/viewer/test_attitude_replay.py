@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import viser
 from scipy.spatial.transform import Rotation
 
 import adcs
 from adcs.viewer.attitude_page import row_lines, strips_html
 from adcs.viewer.attitude_replay import AttitudeReplay, replay_of, rows_at
-from adcs.viewer.attitude_scene import _cone
+from adcs.viewer.attitude_scene import AttitudeScene, _cone
 
 N = 5
 TRUTH = Rotation.from_rotvec(np.linspace([0.1, -0.2, 0.3], [0.5, 1.0, -0.7], N))
@@ -61,6 +62,20 @@ class TestCones:
 
     def test_are_finite_whatever_sigma_is(self, replay: AttitudeReplay) -> None:
         assert (replace(replay, sigma_rad=np.full((N, 3), 1e3)).cones(0, 1e4) < 10.0).all()
+
+
+class TestScene:
+    def test_true_axes_are_those_of_the_row_and_hidden_where_unknown(self, replay: AttitudeReplay) -> None:
+        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        try:
+            scene = AttitudeScene(server.scene, replay)
+            scene.show(2)
+            assert scene._truth.visible
+            np.testing.assert_allclose(scene._truth.wxyz, replay.q_true[2])
+            scene.show(N - 1)
+            assert not scene._truth.visible
+        finally:
+            server.stop()
 
 
 class TestRows:

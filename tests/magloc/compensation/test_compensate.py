@@ -265,6 +265,7 @@ class TestFaults:
         assert time_s == pytest.approx(160.0, abs=8.0)
         assert size_nT == pytest.approx(78.0, rel=0.3)
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("lag_s", [0.3, -0.15])
     def test_lag(self, lag_s: float) -> None:
         flown = fly(103, current_T=0.0, lag_s=lag_s)

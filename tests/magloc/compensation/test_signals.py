@@ -53,6 +53,15 @@ def test_gaps_are_not_bridged() -> None:
     assert np.isfinite(signal.at(TIME[:400])).all()
 
 
+@pytest.mark.parametrize(("more", "number"), [(20, 3), (10, 2)])
+def test_short_stretches_are_left_out(more: int, number: int) -> None:
+    """Between two gaps, by their rows beyond the reach of the filter."""
+    values = wave(TIME)
+    n = more + 4 * Signal.of(TIME, values).step
+    values[400:500] = values[500 + n : 600 + n] = np.nan
+    assert len(Signal.of(TIME, values).stretches) == number
+
+
 def test_white_noise_of_a_smooth_signal() -> None:
     rng = np.random.default_rng(3)
     values = 1e4 * wave(TIME) + 0.3 * rng.standard_normal((len(TIME), 2))

@@ -58,6 +58,7 @@ class TestSoundLog:
         assert quality.flags == []
         assert value(quality, "lag") == 0.0
 
+    @pytest.mark.usefixtures("without_lag")
     def test_heights_over_hills(self) -> None:
         rows = walk(71, hills, 5.0, 3).readings
         found = magloc.check_quality(PAIR, rows, ground_m=terrain_of(hills))
@@ -82,6 +83,7 @@ class TestNoise:
         assert value(quality, "noise", "high") == pytest.approx(np.hypot(0.5, 0.1), rel=0.1)
         assert [check.sensor for check in quality.checks if check.name == "noise" and check.remark] == ["high"]
 
+    @pytest.mark.usefixtures("without_lag")
     def test_a_vector_sensor(self) -> None:
         """Its modulus has the noise of one axis."""
         rng = np.random.default_rng(4)
@@ -100,6 +102,7 @@ class TestHeadingError:
         assert abs(error - size_nT) < 4.0 * sigma
         assert ("heading error" in quality.flags) == (size_nT > 0.0)
 
+    @pytest.mark.usefixtures("without_lag")
     def test_drift_is_none(self) -> None:
         """1 nT a minute, on all courses alike."""
         quality = checked(lambda values: values + 1e-9 * ROWS.time_s[:, None] / 60.0)
@@ -152,11 +155,13 @@ class TestGaps:
         assert value(quality, "way in a gap") == pytest.approx(30.0 * SPEED_M_S / RATE_Hz, rel=1e-3)
         assert quality.flags == ["way in a gap", "widest strip"]
 
+    @pytest.mark.usefixtures("without_lag")
     def test_a_missing_line(self) -> None:
         quality = magloc.check_quality(PAIR, ROWS[np.flatnonzero(LINE != 6)])
         assert value(quality, "widest strip") == pytest.approx(2.0, abs=0.1)
         assert "widest strip" in quality.flags
 
+    @pytest.mark.usefixtures("without_lag")
     def test_jitter(self) -> None:
         """Stamps with errors of 5 ms: intervals scatter by √2 of it, 2 % in the estimate."""
         stamps = ROWS.time_s + np.random.default_rng(5).normal(size=len(ROWS), scale=0.005)

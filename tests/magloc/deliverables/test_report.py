@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 import magloc
 from magloc.deliverables.map_frame import MapFrame
 from magloc.deliverables.report import report_html
+from tests.hills import hills, terrain_of
 
 BLANK = (Figure(figsize=(1.0, 1.0)), Figure(figsize=(1.0, 1.0)))
 
@@ -44,6 +45,11 @@ class TestReportHtml:
         page = report_html(replace(survey, terrain=magloc.Terrain(-1.6)), frame, "Meadow", {}, BLANK)
         assert "<td>origin</td><td>latitude 52.4100000, longitude 13.1200000, height 41.00 m</td>" in page
         assert "<td>ground</td><td>flat, 1.6 m below the origin</td>" in page
+
+    def test_heights_of_a_map_are_those_of_the_ground(self, survey: magloc.Survey, frame: MapFrame) -> None:
+        page = report_html(replace(survey, terrain=terrain_of(hills)), frame, "Meadow", {}, BLANK)
+        (words,) = re.findall("<td>ground</td><td>([^<]*)</td>", page)
+        assert "at heights of " in words
 
     def test_a_single_line_has_no_spacing(self, survey: magloc.Survey, frame: MapFrame, page: str) -> None:
         """Six lines, and the first of them alone."""

@@ -188,7 +188,7 @@ class TestFarFromTheArray:
         assert np.mean(squares / fixes.body_factor**2) == pytest.approx(1.0, abs=0.45)
 
     @pytest.mark.parametrize("relative_noise", [1e-2, 1e-3, 1e-4])
-    @pytest.mark.parametrize("lengths", [2.0, 3.0, 4.0, 6.0])
+    @pytest.mark.parametrize("lengths", [2.0, *(pytest.param(n, marks=pytest.mark.slow) for n in (3.0, 4.0)), 6.0])
     def test_no_body_errs_in_silence(self, lengths, relative_noise):
         """magpylib's, at four lengths as told: NEES is below three squares, else it goes as length to the fourth."""
         for case in cases(lengths, relative_noise, 1, seed=1):

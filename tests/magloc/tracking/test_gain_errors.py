@@ -53,6 +53,7 @@ def mean_nees(seeds: range, n: int) -> float:
         track = magloc.track(board(gain_uncertainty=GAIN), readings, motion=MOTION)
         assert track.tracked.all()
         assert not track.innovations.flagged
+        assert np.isfinite([point.lag1 for point in track][2:]).all()
         covariance = np.array([point.covariance for point in track])
         error = np.concatenate([track.position_m, track.moment_Am2], axis=1) - states
         found.append(normalised_square(error, covariance)[n // 2 :].mean() / 6.0)
@@ -63,8 +64,8 @@ class TestNees:
     """A track has one error for all rows, of its scale: four tracks are below 2 but for a chance of 1e-5."""
 
     def test_of_tracks(self) -> None:
-        # With the effect taken from the readings it is above 8.
-        assert 0.5 < mean_nees(range(31_000, 31_004), 800) < 2.0
+        # With the effect taken from the readings it is above 4.
+        assert 0.5 < mean_nees(range(31_000, 31_004), 400) < 2.0
 
     @pytest.mark.slow
     def test_of_long_tracks(self) -> None:

@@ -6,6 +6,7 @@ import json
 import pickle
 import zlib
 from base64 import b64encode
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -23,15 +24,28 @@ def tracker_of(diver: Any) -> magloc.Tracker:
     return magloc.Tracker(diver.array, magloc.RandomWalk(speed_m_s=0.1, turn_rad_s=0.01))
 
 
-@pytest.mark.parametrize("begin", [20, 35, 93])
+BEGINS = (20, 35, 93)
+
+
+@cache
+def whole_track() -> tuple[list[TrackPoint], dict[int, dict[str, Any]]]:
+    """Return the points of all rows, and the states before some of them."""
+    diver = magloc.datasets.load("diver")
+    tracker = tracker_of(diver)
+    states, found = {}, []
+    for i, row in enumerate(diver.readings):
+        if i in BEGINS:
+            states[i] = tracker.state()
+        found.append(tracker.update(row))
+    return found, states
+
+
+@pytest.mark.parametrize("begin", BEGINS)
 def test_resumes_bit_for_bit(begin: int) -> None:
     """Before a track, while it is young, and settled; through a JSON file."""
-    diver = magloc.datasets.load("diver")
-    whole = points(tracker_of(diver), diver.readings)
-    first = tracker_of(diver)
-    points(first, diver.readings[:begin])
-    resumed = magloc.Tracker.from_state(json.loads(json.dumps(first.state())))
-    found = points(resumed, diver.readings[begin:])
+    whole, states = whole_track()
+    resumed = magloc.Tracker.from_state(json.loads(json.dumps(states[begin])))
+    found = points(resumed, magloc.datasets.load("diver").readings[begin:])
     assert [one.status for one in found] == [one.status for one in whole[begin:]]
     for one, other in zip(found, whole[begin:], strict=True):
         for name in ("position_m", "moment_Am2", "covariance", "nis"):

@@ -259,7 +259,7 @@ class TestCompiledRecord:
         """A source that is weak and far: the iterations that shrink do so in both, and their number is the same."""
         array = geometries.tetrahedron(1.5, "vector", 1e-9)
         rng = np.random.default_rng(9)
-        n = 80
+        n = 40
         p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
         rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
         motion = RandomWalk(0.1, 0.05)

@@ -55,8 +55,15 @@ def rows_of(array: SensorArray, offset_T: float, seed: int, *, rest: int = 0, n_
 
 
 class TestTracks:
-    @pytest.mark.parametrize("rest", [0, 40])
-    @pytest.mark.parametrize(("n", "offset_T"), [(2, 2e-5), (3, 5e-6), (3, 1e-4), (4, 1e-6), (4, 2e-5)])
+    @pytest.mark.parametrize(
+        ("n", "offset_T", "rest"),
+        [
+            # In `make test` each array and offset comes once, with and without a rest in turn.
+            pytest.param(*case, rest, marks=[pytest.mark.slow] if (i + rest // 40) % 2 else [])
+            for i, case in enumerate([(2, 2e-5), (3, 5e-6), (3, 1e-4), (4, 1e-6), (4, 2e-5)])
+            for rest in (0, 40)
+        ],
+    )
     def test_says_so_once_within_twenty_rows(self, n, offset_T, rest, caplog) -> None:
         array = board(n)
         tracker = Tracker(array, MOTION)

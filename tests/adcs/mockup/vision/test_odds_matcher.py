@@ -100,6 +100,13 @@ class TestDamagedFrames:
 
 
 class TestRoughMatcher:
+    def test_its_tolerances_are_wider(self):
+        precise = OddsMatcher.of(catalogue(), Camera())
+        rough = precise.rough()
+        assert rough.length_tolerance_px > precise.length_tolerance_px
+        assert rough.coarse_px > precise.coarse_px
+        assert rough.odds.gate_px > precise.odds.gate_px
+
     @pytest.mark.slow
     def test_a_lens_that_nobody_has_calibrated(self):
         """k1 = -0.05: the precise matcher seldom stands it; with the rough one at least 97 %, at most 2 mm."""

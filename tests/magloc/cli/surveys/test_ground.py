@@ -73,6 +73,7 @@ def assert_depths(targets: list[dict[str, float]]) -> None:
 
 
 class TestTerrain:
+    @pytest.mark.usefixtures("without_lag")
     def test_a_map_of_heights(self, folder: Path, run: Run) -> None:
         line = ("--array", folder / "sea.toml", "--terrain", folder / "dem.tif", "--json")
         done = run("survey", folder / "walk.csv", *line)

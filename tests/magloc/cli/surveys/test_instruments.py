@@ -14,6 +14,7 @@ LINE = ["survey", "magarrow.csv", "--instrument", "magarrow", "--place", "48", "
 
 
 class TestInstrument:
+    @pytest.mark.usefixtures("without_lag")
     def test_finds_the_target_of_the_same_survey(
         self, files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:

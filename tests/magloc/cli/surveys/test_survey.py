@@ -80,6 +80,7 @@ class TestSurvey:
         assert found["rows"] == 481
         assert found["seconds"] > 0.0
 
+    @pytest.mark.usefixtures("without_lag")
     def test_files(self, folder: Path, tmp_path: Path, run: Run) -> None:
         pytest.importorskip("pymap3d")
         outputs = (
@@ -102,7 +103,7 @@ class TestSurvey:
         assert "<Placemark>" in (tmp_path / "t.kml").read_text()
         assert "t1" in done.out
 
-    @pytest.mark.usefixtures("without_pictures")
+    @pytest.mark.usefixtures("without_pictures", "without_lag")
     def test_a_review_is_applied_and_written(self, folder: Path, tmp_path: Path, run: Run) -> None:
         log = tmp_path / "decisions.jsonl"
         log.write_text('{"action": "exclude", "from_s": 0, "to_s": 5}\n{"action": "split", "target": "t1"}\n')
@@ -126,7 +127,7 @@ class TestSurvey:
         assert "decisions.jsonl, targets.geojson" in without.err
         assert "are of an earlier run" in without.err
 
-    @pytest.mark.usefixtures("without_pictures")
+    @pytest.mark.usefixtures("without_pictures", "without_lag")
     def test_the_page_of_a_review_saves_into_the_folder(
         self, folder: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -173,6 +174,7 @@ class TestSurvey:
         )
         assert whole == both
 
+    @pytest.mark.usefixtures("without_lag")
     def test_base_station(self, folder: Path, tmp_path: Path, run: Run) -> None:
         """A storm at the sensors and at the base station changes nothing."""
         head, *rows = (folder / "ground.csv").read_text().splitlines()
@@ -204,6 +206,7 @@ class TestSurvey:
         assert_refused(run(*line, "--region", "z>1"), "room below the ground")
 
 
+@pytest.mark.usefixtures("without_lag")
 class TestDoubts:
     """Numbers of another frame or field are refused or named, in the JSON too."""
 
@@ -275,6 +278,7 @@ def target(folder: Path) -> dict[str, float]:
     return {"easting": easting, "northing": northing, "latitude": latitude, "longitude": longitude}
 
 
+@pytest.mark.usefixtures("without_lag")
 class TestMaps:
     """A log in UTM becomes what a client's map opens: targets in the log's system and in WGS 84."""
 
