@@ -96,6 +96,16 @@ class TestTerrain:
         np.testing.assert_allclose(flown, CLEARANCE_M + 0.5, atol=0.05)  # the middle of both sensors
 
     @pytest.mark.usefixtures("without_lag")
+    @pytest.mark.parametrize("down_m", [0.0, 45.0])
+    def test_heights_of_the_ellipsoid_above_a_map_of_the_sea(self, folder: Path, run: Run, down_m: float) -> None:
+        """The sea is 45 m above the ellipsoid: a note names the median height of the lower sensor above the terrain."""
+        line = ("--array", folder / "sea.toml", "--terrain", folder / "dem.tif", "--ground-m", -down_m)
+        done = run("qc", folder / "walk.csv", *line)
+        assert done.status == 0, done.err
+        assert ("raise the terrain by the difference" in done.err) == (down_m > 0.0)
+        assert not down_m or f"in the median {down_m + CLEARANCE_M:.4g} m, above" in done.err
+
+    @pytest.mark.usefixtures("without_lag")
     def test_an_altimeter(self, folder: Path, run: Run) -> None:
         done = run("survey", folder / "walk.csv", "--array", folder / "sea.toml", "--terrain", "Above", "--json")
         assert done.status == 0, done.err
