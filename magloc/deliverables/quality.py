@@ -17,17 +17,18 @@ from arrays.io.results import Result
 from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
-from magloc.deliverables.lag import clock_lag, without_ambient
+from magloc.deliverables.lag import clock_lag
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.measurement.plausibility import EARTH_T, finite_median, robust_sigma
 from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
+from magloc.navigation.crossovers import ClockShift
 from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
 from magloc.readings import Readings, without_saturated
-from magloc.surveying.clock import ClockLag
+from magloc.surveying.clock import ClockLag, shift_of_places
 from magloc.surveying.fit.sensor_noise import NOISY, white_noise_T
 from magloc.surveying.piece import Ground
-from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings
+from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings, without_ambient
 from magloc.terrain.surface import Terrain
 
 GAP = 3.0
@@ -106,7 +107,8 @@ class Quality(Result):
     heading : list of HeadingError or None
         For each sensor; None if the lines do not determine it.
     lag : ClockLag, optional
-        Delay of the readings after their poses; 0 if the targets show none. None without targets or an ambient field.
+        Delay of the readings after their poses; 0 if the targets show none, with an infinite σ if they do not determine
+        it. None without targets or an ambient field.
     coverage : Coverage, optional
         None for a single line.
     field_T : ndarray, shape (N,)
@@ -115,6 +117,8 @@ class Quality(Result):
         Share of rows whose place stands still between fixes of the receiver.
     level_share : float
         Horizontal share of the ambient field: the heading error by a level field of 1 that is fixed to the array.
+    clock : ClockShift, optional
+        Agreement of lines flown in opposite directions, and the time of the places with which it is better.
 
     Examples
     --------
@@ -149,6 +153,7 @@ class Quality(Result):
     field_T: FloatArray
     held: float
     level_share: float = 1.0
+    clock: ClockShift | None = None
 
     @property
     def interval_s(self) -> float:
@@ -177,8 +182,8 @@ class Quality(Result):
 
     @property
     def flags(self) -> list[str]:
-        """Names of the properties that are faults, in the order of the table."""
-        return list(dict.fromkeys(check.name for check in self.checks if check.remark))
+        """Names of the properties that are faults, in the order of the table; an unknown value is none."""
+        return list(dict.fromkeys(check.name for check in self.checks if check.remark and not math.isnan(check.value)))
 
     def _sampling(self) -> Iterator[Check]:
         def check(name: str, value: float, unit: str, remark: str = "") -> Check:
@@ -200,11 +205,17 @@ class Quality(Result):
             remark = f"the carrier moved on, at {gaps.start_s[farthest]:.10g} s" if way_m > _WIDE * spacing_m else ""
             yield check("way in a gap", way_m, "m", remark)
         yield check("held places", 100.0 * self.held, "%")
-        if self.lag is not None:
+        is_late = False
+        if self.lag is not None and math.isfinite(self.lag.sigma_s):
             is_late = abs(self.lag.s) > _SIGNIFICANT * self.lag.sigma_s
             yield check("lag", 1e3 * self.lag.s, "ms", "readings and poses differ in time" if is_late else "")
-            if math.isfinite(self.lag.sigma_s):
-                yield check("lag ±", 1e3 * self.lag.sigma_s, "ms")
+            yield check("lag ±", 1e3 * self.lag.sigma_s, "ms")
+        else:
+            yield check("lag", math.nan, "ms", "not determined by this log")
+        if self.clock is not None:
+            is_told = self.clock.s and (self.clock.is_leap or not is_late)
+            share = 100.0 * max(self.clock.agreement_now, 0.0)
+            yield check("agreement of lines", share, "%", self.clock.remark if is_told else "")
 
     def _way(self) -> Iterator[Check]:
         def check(name: str, value: float, unit: str, remark: str = "") -> Check:
@@ -360,6 +371,7 @@ def check_quality(
         np.array([finite_median(column) for column in np.where(stuck | spikes, np.nan, read_T).T]),
         held,
         _level_share(rows),
+        shift_of_places(array, whole),
     )
 
 

@@ -9,14 +9,13 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from arrays.typing import FloatArray, IntArray
-from magloc.measurement.plausibility import robust_sigma
 from magloc.navigation.flight_lines import FlightLine, covers_area, line_spacing
 
 _ALONG = 0.25  # way between rows that are used, in spacings of lines
 _MOST_ROWS = 40_000
 _NEAR = 1.5  # distance of neighbours, in usual distances of opposite lines as logged
 _ALIGNED = 0.5  # least cosine between a line and the usual course
-_SCALE = 3.0  # readings above so many usual ones count by their logarithm, so that one anomaly does not decide
+_SCALE = 4.5  # readings above so many usual moduli count by their logarithm, so that one anomaly does not decide
 _SMALL_S = np.linspace(-1.5, 1.5, 31)
 _LEAPS_S = np.array([18.0, *(3600.0 * np.arange(1, 13))])  # GPS time is 18 s ahead of UTC, local times whole hours
 _LEAST_SHARE, _FEWEST = 0.3, 200  # of neighbours that a shift leaves
@@ -83,7 +82,7 @@ def clock_shift(
     values = np.zeros(len(time_s))
     for own in (each.rows for each in lines):
         values[own] = values_T[own] - np.median(values_T[own])
-    size = robust_sigma(values[line >= 0])
+    size = float(np.median(np.abs(values[line >= 0])))
     if not size > 0.0:
         return None
     values = np.arcsinh(values / (_SCALE * size))

@@ -20,6 +20,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
+from magloc.surveying.clock import shift_of_places
 from magloc.surveying.piece import Ground, significant_sources, strongest_sources
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Survey
@@ -143,7 +144,10 @@ def survey(
         with_offsets = tiled.with_likeliest_offsets()
         again = tiled.changes() if with_offsets is tiled else range(len(tiled.tiles))
         tiled, _ = with_offsets.settle(strongest_sources, each, tell, again)
+        clock = shift_of_places(array, tiled.readings)
         tiled, lag = tiled.correct_lag(assumed)
+        if clock is not None and clock.s and (clock.is_leap or not lag.s):
+            _LOG.warning(clock.warning)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show;"
