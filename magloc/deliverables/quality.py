@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -27,6 +27,7 @@ from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.clock import ClockLag, shift_of_places
 from magloc.surveying.fit.sensor_noise import NOISY, white_noise_T
+from magloc.surveying.fit.sensor_order import size_of_anomalies, weaker_sensors_below
 from magloc.surveying.piece import Ground
 from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings, without_ambient
 from magloc.terrain.surface import Terrain
@@ -36,6 +37,7 @@ GAP = 3.0
 _JITTER, _MISSING, _SPIKES = 0.1, 0.01, 1e-3  # shares that are faults
 _LEAST_LEVEL = 0.2  # least horizontal share of the ambient field: near the poles it is small
 _SIGNIFICANT = 3.0  # standard deviations of the lag and of the heading error
+_ZONE_S = 1800.0  # times of zones differ by multiples of it
 _WIDE = 1.7  # times the spacing of lines
 _NEAR = 0.75  # distance of a covered place from a line, in spacings
 _FOURTH = math.sqrt(70.0)  # standard deviation of the fourth difference of white noise
@@ -119,6 +121,11 @@ class Quality(Result):
         Horizontal share of the ambient field: the heading error by a level field of 1 that is fixed to the array.
     clock : ClockShift, optional
         Agreement of lines flown in opposite directions, and the time of the places with which it is better.
+    anomalies_T : ndarray, shape (N,)
+        Standard deviation of each sensor's modulus around the medians of lines.
+    weaker_below : tuple of str
+        For each sensor, another sensor below it whose anomalies are smaller; "" without one. The field of the ground
+        decays upwards.
 
     Examples
     --------
@@ -154,6 +161,8 @@ class Quality(Result):
     held: float
     level_share: float = 1.0
     clock: ClockShift | None = None
+    anomalies_T: FloatArray = field(default_factory=lambda: np.zeros(0))
+    weaker_below: tuple[str, ...] = ()
 
     @property
     def interval_s(self) -> float:
@@ -199,9 +208,13 @@ class Quality(Result):
         yield check("gaps", len(gaps.start_s), "")
         if len(gaps.start_s):
             longest, farthest = int(gaps.duration_s.argmax()), int(gaps.way_m.argmax())
-            yield check("longest gap", float(gaps.duration_s[longest]), "s")
-            way_m = float(gaps.way_m[farthest])
             spacing_m = math.inf if self.coverage is None else self.coverage.spacing_m
+            rest_s = math.remainder(gaps.duration_s[longest] - self.interval_s, _ZONE_S)
+            is_leap = gaps.duration_s[longest] > _ZONE_S / 2.0 and abs(rest_s) < GAP * self.interval_s
+            is_leap &= bool(gaps.way_m[longest] < _WIDE * spacing_m)
+            remark = f"the clock leaps by half hours or days at {gaps.start_s[longest]:.10g} s" if is_leap else ""
+            yield check("longest gap", float(gaps.duration_s[longest]), "s", remark)
+            way_m = float(gaps.way_m[farthest])
             remark = f"the carrier moved on, at {gaps.start_s[farthest]:.10g} s" if way_m > _WIDE * spacing_m else ""
             yield check("way in a gap", way_m, "m", remark)
         yield check("held places", 100.0 * self.held, "%")
@@ -248,6 +261,9 @@ class Quality(Result):
             times = f"{noise_T / stated_T:.1f} times the stated noise: noise_nT = {1e9 * noise_T:.2g}"
             remark = times if noise_T > NOISY * stated_T else ""
             yield Check("noise", sensor.id, 1e9 * noise_T, "nT", remark)
+            lower = self.weaker_below[i]
+            remark = f"larger than those of {lower} below it: exchanged?" if lower else ""
+            yield Check("anomalies", sensor.id, 1e9 * float(self.anomalies_T[i]), "nT", remark)
             for name, which, most in (
                 ("missing", self.missing, _MISSING),
                 ("stuck", self.stuck, 0.0),
@@ -353,6 +369,7 @@ def check_quality(
     lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
     coverage = _coverage(place_m[:, :2], lines)
     whole = rows[np.flatnonzero(~unusable.any(axis=1))]
+    anomalies_T = size_of_anomalies(array, whole)
     return Quality(
         array,
         rows.time_s,
@@ -372,6 +389,8 @@ def check_quality(
         held,
         _level_share(rows),
         shift_of_places(array, whole),
+        anomalies_T,
+        weaker_sensors_below(array, whole, anomalies_T),
     )
 
 

@@ -112,6 +112,17 @@ class TestHeadingError:
         assert magloc.check_quality(PAIR, rows).heading == [None, None]
 
 
+class TestOrder:
+    @pytest.mark.usefixtures("without_lag")
+    def test_exchanged_columns(self) -> None:
+        """The field of the ground decays upwards."""
+        quality = checked(lambda values: values[:, ::-1])
+        (check,) = [check for check in quality.checks if check.name == "anomalies" and check.remark]
+        assert check.sensor == "high"
+        assert check.remark == "larger than those of low below it: exchanged?"
+        assert quality.anomalies_T[1] > 2.0 * quality.anomalies_T[0]
+
+
 class TestLag:
     @pytest.mark.parametrize("late", [-2, 2])
     def test_readings_of_other_rows(self, late: int) -> None:
@@ -178,6 +189,15 @@ class TestGaps:
         assert quality.gaps.duration_s[lost] == pytest.approx(30.0 / RATE_Hz)
         assert value(quality, "way in a gap") == pytest.approx(30.0 * SPEED_M_S / RATE_Hz, rel=1e-3)
         assert quality.flags == ["way in a gap", "widest strip"]
+
+    @pytest.mark.usefixtures("without_lag")
+    @pytest.mark.parametrize(("leap_s", "is_flagged"), [(3600.0, True), (207 * 86400.0, True), (3601.0, False)])
+    def test_a_clock_that_leaps(self, leap_s: float, is_flagged: bool) -> None:
+        """Summer time begins, or day and month change places; a pause ends at any time."""
+        later = leap_s * (np.arange(len(ROWS)) > 5 * PER_LINE + 20)
+        quality = magloc.check_quality(PAIR, replace(ROWS, time_s=ROWS.time_s + later))
+        assert value(quality, "longest gap") == pytest.approx(leap_s + 1.0 / RATE_Hz)
+        assert ("longest gap" in quality.flags) == is_flagged
 
     def test_a_missing_line(self) -> None:
         quality = magloc.check_quality(PAIR, ROWS[np.flatnonzero(LINE != 6)])
