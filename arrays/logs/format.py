@@ -110,7 +110,7 @@ class LogFormat:
             text = text.replace("\t", " ")
         line, labels = 0, list[tuple[int, str]]()
         if head is None:
-            text = text.replace("\r\n", "\n").replace("\r", "\n").removeprefix("\ufeff")
+            text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\ufeff", "")  # also those of joined files
             head, text, first_line, labels = header_and_rows(
                 text, name, columns, self._theirs(columns), self._is_time, quiet=quiet
             )

@@ -83,6 +83,7 @@ def header_and_rows(
         if pattern:
             rows, n = re.subn(rf"^[ \t]*(?:{pattern}).*", "", rows, flags=re.MULTILINE)
             found += [f"{n} lines of {called} are left out"] * (n > 0)
+    _refuse_another_header(rows, name, first, columns, wanted)
     below = re.search(r"^.*\S.*$", rows, flags=re.MULTILINE)
     if line and below is not None and _are_units(cells_of(below[0], columns), header, is_time):
         rows = rows[: below.start()] + rows[below.end() :]
@@ -92,6 +93,20 @@ def header_and_rows(
     if found and not quiet:
         _LOG.info(f"{name}: {', '.join(found)}")
     return LogText(_empty(name, header, number), rows, first, labels)
+
+
+def _refuse_another_header(rows: str, name: str, first: int, columns: LogColumns, wanted: Sequence[str]) -> None:
+    """Refuse a second header with other columns, as a logger writes after a restart with another setting."""
+    at = rows.find(max(wanted, key=len))
+    if at < 0:
+        return
+    begin, end = rows.rfind("\n", 0, at) + 1, rows.find("\n", at)
+    if set(wanted) <= set(cells_of(rows[begin : end if end > 0 else None], columns)):
+        line = first + rows.count("\n", 0, begin)
+        raise InputError(
+            f"{name}, line {line}: found a second header with other columns, expected one header: cut the file above"
+            " this line, and read both parts."
+        )
 
 
 def _empty(name: str, header: tuple[str, ...], number: int) -> Table:

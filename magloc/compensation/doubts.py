@@ -13,12 +13,13 @@ from magloc.compensation.fit import FEWEST_ROWS, Background, PlatformFit
 from magloc.compensation.log import PlatformLog
 from magloc.compensation.results import SensorCompensation
 from magloc.compensation.signals import band_passed
-from magloc.measurement.plausibility import EARTH_T
+from magloc.measurement.plausibility import EARTH_T, robust_sigma
 from magloc.surveying.preparation import field_moduli
 
 _LATE_SIGMAS, _LATE_S = 4.0, 0.02
 _TURNED_DEG = 5.0
 _FALSE_ALARM = 1e-4
+_OUTLIER = 5.0  # standard deviations
 _CANDIDATES = 40
 _NOISE_RATIO = 5.0
 _UNSURE_T = 1e-10
@@ -132,20 +133,26 @@ def _change(fit: PlatformFit) -> tuple[float, float] | None:
     """Return the time and size of the most significant step of the permanent field; None without one.
 
     A score test: residuals against three components from each of some times on, with all coefficients estimated. The
-    residuals' own size is the unit, because those of a survey are larger than the noise.
+    background is the likeliest one, so that the residuals are white and the score has the distribution of χ². If it
+    is larger than the usual one, as a step makes it, the usual one is taken. Outliers do not count, because a jump of
+    the background is no step of the platform's field, which varies with the attitude. The residuals' own size is the
+    unit, because those of a survey are larger than the noise.
     """
-    background = Background.usual(fit.rows.noise_T)
+    usual, likeliest = Background.usual(fit.rows.noise_T), fit.background
+    is_calm = likeliest.walk_nT_rts <= usual.walk_nT_rts and likeliest.bend_nT_s15 <= usual.bend_nT_s15
+    background = likeliest if is_calm else usual
     solved = fit.problem.solve(background)
-    A, r, n = solved.columns, solved.innovations, len(solved.innovations)
+    good = np.abs(solved.innovations) <= _OUTLIER * robust_sigma(solved.innovations)
+    A, r, rows = solved.columns[good], solved.innovations[good], len(good)
     white = background.whitening(fit.rows.time_s)
     unit = fit.field_T / np.linalg.norm(fit.field_T, axis=1, keepdims=True)
-    begins = np.linspace(0, n, _CANDIDATES + 2)[1:-1].astype(np.intp)
-    steps = np.concatenate([np.where(np.arange(n)[:, None] >= k, unit, 0.0) for k in begins], axis=1)
+    begins = np.linspace(0, rows, _CANDIDATES + 2)[1:-1].astype(np.intp)
+    steps = np.concatenate([np.where(np.arange(rows)[:, None] >= k, unit, 0.0) for k in begins], axis=1)
     S = np.ascontiguousarray(steps[:, None] / background.noise_nT)
-    white.whiten(S, np.arange(n))
-    S = S[:, 0]
-    inverse = np.linalg.inv(A.T @ A + np.eye(A.shape[1]))
-    scores, across = S.T @ r, S.T @ A
+    white.whiten(S, np.arange(rows))
+    S = S[good, 0]
+    inverse, across = np.linalg.inv(A.T @ A + np.eye(A.shape[1])), S.T @ A
+    scores = S.T @ r - across @ inverse @ (A.T @ r - solved.mean)
     prior = np.diag((1e9 * fit.terms.sigma[:3]) ** -2.0)
     best, begin, step_nT = 0.0, 0, np.zeros(3)
     for k, first in enumerate(begins):
@@ -155,6 +162,6 @@ def _change(fit: PlatformFit) -> tuple[float, float] | None:
         score = float(scores[own] @ estimate)
         if score > best:
             best, begin, step_nT = score, int(first), np.asarray(estimate)
-    is_sure = best > float(chi2.isf(_FALSE_ALARM / _CANDIDATES, 3)) * float(r @ r) / n
+    is_sure = best > float(chi2.isf(_FALSE_ALARM / _CANDIDATES, 3)) * float(r @ r) / len(r)
     is_small = bool((np.abs(step_nT) < 1e9 * fit.sigma[:3]).all())  # within the uncertainty of the permanent field
     return (float(fit.rows.time_s[begin]), 1e-9 * float(np.linalg.norm(step_nT))) if is_sure and not is_small else None

@@ -7,24 +7,16 @@ import logging
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
 from magloc.grids.work import workers
 from magloc.readings import Readings
 from magloc.surveying.clock import ClockLag
 from magloc.surveying.piece import Ground, strongest_sources
-from magloc.surveying.preparation import FASTEST_M_S, FEWEST_ROWS, field_moduli
+from magloc.surveying.preparation import FASTEST_M_S, FEWEST_ROWS, field_moduli, without_ambient
 from magloc.surveying.survey import tile_rows
 
 _LOG = logging.getLogger(__name__)
 _HEIGHTS, _SPACINGS = 10.0, 3.0  # half width of the area from which the lag is estimated
 _MOST_ROWS = 10_000
-
-
-def without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
-    """Return moduli less that of the ambient field, where it is known for every row."""
-    if rows.ambient_T is None:
-        return moduli_T
-    return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
 
 
 def clock_lag(array: SensorArray, rows: Readings, ground: Ground, spacing_m: float) -> ClockLag | None:

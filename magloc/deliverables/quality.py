@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,17 +17,19 @@ from arrays.io.results import Result
 from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.heading import HeadingError, heading_error
-from magloc.deliverables.lag import clock_lag, without_ambient
+from magloc.deliverables.lag import clock_lag
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.measurement.plausibility import EARTH_T, finite_median, robust_sigma
 from magloc.measurement.rows import check_magnitudes, check_order, concatenate_readings
+from magloc.navigation.crossovers import ClockShift
 from magloc.navigation.fixes import between_fixes
 from magloc.navigation.flight_lines import FlightLine, covers_area, flight_lines, line_spacing
 from magloc.readings import Readings, without_saturated
-from magloc.surveying.clock import ClockLag
+from magloc.surveying.clock import ClockLag, shift_of_places
 from magloc.surveying.fit.sensor_noise import NOISY, white_noise_T
+from magloc.surveying.fit.sensor_order import size_of_anomalies, weaker_sensors_below
 from magloc.surveying.piece import Ground
-from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings
+from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings, without_ambient
 from magloc.terrain.surface import Terrain
 
 GAP = 3.0
@@ -35,6 +37,7 @@ GAP = 3.0
 _JITTER, _MISSING, _SPIKES = 0.1, 0.01, 1e-3  # shares that are faults
 _LEAST_LEVEL = 0.2  # least horizontal share of the ambient field: near the poles it is small
 _SIGNIFICANT = 3.0  # standard deviations of the lag and of the heading error
+_ZONE_S = 1800.0  # times of zones differ by multiples of it
 _WIDE = 1.7  # times the spacing of lines
 _NEAR = 0.75  # distance of a covered place from a line, in spacings
 _FOURTH = math.sqrt(70.0)  # standard deviation of the fourth difference of white noise
@@ -106,7 +109,8 @@ class Quality(Result):
     heading : list of HeadingError or None
         For each sensor; None if the lines do not determine it.
     lag : ClockLag, optional
-        Delay of the readings after their poses; 0 if the targets show none. None without targets or an ambient field.
+        Delay of the readings after their poses; 0 if the targets show none, with an infinite σ if they do not determine
+        it. None without targets or an ambient field.
     coverage : Coverage, optional
         None for a single line.
     field_T : ndarray, shape (N,)
@@ -115,6 +119,13 @@ class Quality(Result):
         Share of rows whose place stands still between fixes of the receiver.
     level_share : float
         Horizontal share of the ambient field: the heading error by a level field of 1 that is fixed to the array.
+    clock : ClockShift, optional
+        Agreement of lines flown in opposite directions, and the time of the places with which it is better.
+    anomalies_T : ndarray, shape (N,)
+        Standard deviation of each sensor's modulus around the medians of lines.
+    weaker_below : tuple of str
+        For each sensor, another sensor below it whose anomalies are smaller; "" without one. The field of the ground
+        decays upwards.
 
     Examples
     --------
@@ -149,6 +160,9 @@ class Quality(Result):
     field_T: FloatArray
     held: float
     level_share: float = 1.0
+    clock: ClockShift | None = None
+    anomalies_T: FloatArray = field(default_factory=lambda: np.zeros(0))
+    weaker_below: tuple[str, ...] = ()
 
     @property
     def interval_s(self) -> float:
@@ -177,8 +191,8 @@ class Quality(Result):
 
     @property
     def flags(self) -> list[str]:
-        """Names of the properties that are faults, in the order of the table."""
-        return list(dict.fromkeys(check.name for check in self.checks if check.remark))
+        """Names of the properties that are faults, in the order of the table; an unknown value is none."""
+        return list(dict.fromkeys(check.name for check in self.checks if check.remark and not math.isnan(check.value)))
 
     def _sampling(self) -> Iterator[Check]:
         def check(name: str, value: float, unit: str, remark: str = "") -> Check:
@@ -194,17 +208,27 @@ class Quality(Result):
         yield check("gaps", len(gaps.start_s), "")
         if len(gaps.start_s):
             longest, farthest = int(gaps.duration_s.argmax()), int(gaps.way_m.argmax())
-            yield check("longest gap", float(gaps.duration_s[longest]), "s")
-            way_m = float(gaps.way_m[farthest])
             spacing_m = math.inf if self.coverage is None else self.coverage.spacing_m
+            rest_s = math.remainder(gaps.duration_s[longest] - self.interval_s, _ZONE_S)
+            is_leap = gaps.duration_s[longest] > _ZONE_S / 2.0 and abs(rest_s) < GAP * self.interval_s
+            is_leap &= bool(gaps.way_m[longest] < _WIDE * spacing_m)
+            remark = f"the clock leaps by half hours or days at {gaps.start_s[longest]:.10g} s" if is_leap else ""
+            yield check("longest gap", float(gaps.duration_s[longest]), "s", remark)
+            way_m = float(gaps.way_m[farthest])
             remark = f"the carrier moved on, at {gaps.start_s[farthest]:.10g} s" if way_m > _WIDE * spacing_m else ""
             yield check("way in a gap", way_m, "m", remark)
         yield check("held places", 100.0 * self.held, "%")
-        if self.lag is not None:
+        is_late = False
+        if self.lag is not None and math.isfinite(self.lag.sigma_s):
             is_late = abs(self.lag.s) > _SIGNIFICANT * self.lag.sigma_s
             yield check("lag", 1e3 * self.lag.s, "ms", "readings and poses differ in time" if is_late else "")
-            if math.isfinite(self.lag.sigma_s):
-                yield check("lag ±", 1e3 * self.lag.sigma_s, "ms")
+            yield check("lag ±", 1e3 * self.lag.sigma_s, "ms")
+        else:
+            yield check("lag", math.nan, "ms", "not determined by this log")
+        if self.clock is not None:
+            is_told = self.clock.s and (self.clock.is_leap or not is_late)
+            share = 100.0 * max(self.clock.agreement_now, 0.0)
+            yield check("agreement of lines", share, "%", self.clock.remark if is_told else "")
 
     def _way(self) -> Iterator[Check]:
         def check(name: str, value: float, unit: str, remark: str = "") -> Check:
@@ -237,6 +261,9 @@ class Quality(Result):
             times = f"{noise_T / stated_T:.1f} times the stated noise: noise_nT = {1e9 * noise_T:.2g}"
             remark = times if noise_T > NOISY * stated_T else ""
             yield Check("noise", sensor.id, 1e9 * noise_T, "nT", remark)
+            lower = self.weaker_below[i]
+            remark = f"larger than those of {lower} below it: exchanged?" if lower else ""
+            yield Check("anomalies", sensor.id, 1e9 * float(self.anomalies_T[i]), "nT", remark)
             for name, which, most in (
                 ("missing", self.missing, _MISSING),
                 ("stuck", self.stuck, 0.0),
@@ -342,6 +369,7 @@ def check_quality(
     lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
     coverage = _coverage(place_m[:, :2], lines)
     whole = rows[np.flatnonzero(~unusable.any(axis=1))]
+    anomalies_T = size_of_anomalies(array, whole)
     return Quality(
         array,
         rows.time_s,
@@ -360,6 +388,9 @@ def check_quality(
         np.array([finite_median(column) for column in np.where(stuck | spikes, np.nan, read_T).T]),
         held,
         _level_share(rows),
+        shift_of_places(array, whole),
+        anomalies_T,
+        weaker_sensors_below(array, whole, anomalies_T),
     )
 
 

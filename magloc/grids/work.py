@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from functools import partial
-from importlib.metadata import version
+from functools import cache, partial
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,8 @@ Arrays = Mapping[str, NDArray[Any]]
 Work = Callable[[Any], Arrays]
 Each = Callable[[Work, Iterable[Any]], Iterator[tuple[int, Arrays]]]
 """Function that yields the numbers of items, in any order, with the results of the work on them."""
+_LOG = logging.getLogger(__name__)
+_CODE = (".py", ".so", ".dylib", ".dll", ".pyd")
 _PER_PROCESS = 2  # items sent to each process: one that it computes, and the next one
 
 
@@ -44,8 +47,10 @@ def runner(scheduler: str | None) -> Callable[[Callable[[Any], Any], Iterable[An
 def workers(processes: int, scheduler: str | None, folder: Path | None) -> Iterator[Each]:
     """Provide a function that works on many items, in processes or by the workers of a dask scheduler.
 
-    Results are cached in a folder. Work whose result is there is not done again.
+    Results are cached in a folder. Work whose result is there is not done again, unless other code computed it.
     """
+    if folder is not None and (older := [path for path in folder.glob("*.npz") if _code() not in path.name]):
+        _LOG.warning(f"{folder}: {len(older)} finished parts are of another version of magloc, and are computed again")
     with ExitStack() as stack:
         run = runner(scheduler)
         if scheduler is None and processes > 1:
@@ -60,7 +65,7 @@ def _each(run: Callable[..., Iterator[Any]], folder: Path | None, work: Work, it
     def not_done() -> Iterator[tuple[int, Any]]:
         for number, item in enumerate(items):
             if folder is not None:
-                paths[number] = folder / f"{_key(work, item)}.npz"
+                paths[number] = folder / f"{_code()}-{_key(work, item)}.npz"
                 if (result := _read(paths[number])) is not None:
                     before.append((number, result))
                     continue
@@ -93,9 +98,21 @@ def _numbered(work: Work, item: tuple[int, Any]) -> tuple[int, Arrays]:
 
 
 def _key(work: Work, item: Any) -> str:
-    """Return the key of a cached result: a hash of everything that determines it."""
-    content = pickle.dumps((version("magloc"), work, item), protocol=5)
-    return hashlib.sha256(content).hexdigest()
+    """Return the key of a cached result: a hash of all inputs that determine it."""
+    return hashlib.sha256(pickle.dumps((work, item), protocol=5)).hexdigest()
+
+
+@cache
+def _code() -> str:
+    """Return a hash of the installed code, which differs between two states of the same version."""
+    digest = hashlib.sha256()
+    for package in ("arrays", "magloc"):
+        spec = find_spec(package)
+        assert spec is not None
+        for root in map(Path, spec.submodule_search_locations or ()):
+            for path in sorted(each for each in root.rglob("*") if each.suffix in _CODE):
+                digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def _read(path: Path) -> Arrays | None:

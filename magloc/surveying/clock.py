@@ -13,11 +13,15 @@ from scipy.interpolate import BSpline, make_lsq_spline
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
+from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
+from magloc.navigation.crossovers import ClockShift, clock_shift
+from magloc.navigation.flight_lines import flight_lines
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.piece import Piece, search_rounds
+from magloc.surveying.preparation import field_moduli, without_ambient
 from magloc.surveying.rounds import WHILE_SEARCHING
 
 _STEP_M = 0.05  # step along the path for the curvature of the likelihood
@@ -45,6 +49,16 @@ class Trial(NamedTuple):
     sources: Sources
     cost: float
     chi2: float
+
+
+def shift_of_places(array: SensorArray, readings: Readings) -> ClockShift | None:
+    """Return the time of the places with which lines flown in opposite directions agree; None if they cannot tell."""
+    place_m = readings.array_position_m
+    if place_m is None or not len(readings):
+        return None
+    values_T = without_ambient(readings, field_moduli(array, readings.values_T)).mean(axis=1)
+    lines = flight_lines(readings.time_s, place_m, place_m[:, 2], readings.lines)
+    return clock_shift(readings.time_s, place_m, values_T, lines)
 
 
 def by_cost(one: Trial) -> float:

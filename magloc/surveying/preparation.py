@@ -162,6 +162,13 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
     return np.asarray(lengths > _LONGEST_RUN * (1.0 if least >= n else least))  # a log of one reading shows no field
 
 
+def without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
+    """Return moduli less that of the ambient field, where it is known for every row."""
+    if rows.ambient_T is None:
+        return moduli_T
+    return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
+
+
 def leaping_rows(readings: Readings) -> BoolArray:
     """Return the rows (n,) whose place is far from those before and after."""
     assert readings.array_position_m is not None

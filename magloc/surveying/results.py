@@ -257,18 +257,23 @@ class Survey(Result):
     def levelled_rows(self) -> SurveyRows:
         """Rows for maps, without the level of their line (:func:`magloc.surveying.fit.levelling.line_levels`).
 
-        The levels are estimated from the residual, so that targets do not count.
+        The levels are estimated from the residual, so that targets do not count. The median of the rest is removed from
+        both maps too, because the offset of the anomaly is not that of the ground without targets.
         """
-        level_T = line_levels(self.rows.place_m, self.rows.residual_T, self.flight_lines)
+        level_T = self._levels_T
+        level_T = level_T + float(np.median(self.rows.residual_T - level_T))
         return self.rows._replace(anomaly_T=self.rows.anomaly_T - level_T, residual_T=self.rows.residual_T - level_T)
+
+    @cached_property
+    def _levels_T(self) -> FloatArray:
+        return line_levels(self.rows.place_m, self.rows.residual_T, self.flight_lines)
 
     @property
     def levelling(self) -> str:
         """Levelling of the maps in words."""
-        level_T = self.rows.residual_T - self.levelled_rows.residual_T
-        if not level_T.any():
+        if not self._levels_T.any():
             return f"lines not levelled: fewer than {FEWEST_LINES}, or on one line"
-        return f"offset and drift of each line removed, {1e9 * float(np.std(level_T)):.2g} nT rms"
+        return f"offset and drift of each line removed, {1e9 * float(np.std(self._levels_T)):.2g} nT rms"
 
     @property
     def reach_by_depth(self) -> dict[float, Reach]:

@@ -20,6 +20,8 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
 from magloc.readings import Readings
+from magloc.surveying.clock import shift_of_places
+from magloc.surveying.fit.sensor_order import size_of_anomalies, weaker_sensors_below
 from magloc.surveying.piece import Ground, significant_sources, strongest_sources
 from magloc.surveying.preparation import whole_rows, with_places_between_fixes
 from magloc.surveying.results import Survey
@@ -143,7 +145,11 @@ def survey(
         with_offsets = tiled.with_likeliest_offsets()
         again = tiled.changes() if with_offsets is tiled else range(len(tiled.tiles))
         tiled, _ = with_offsets.settle(strongest_sources, each, tell, again)
+        _warn_of_order(array, tiled.readings)
+        clock = shift_of_places(array, tiled.readings)
         tiled, lag = tiled.correct_lag(assumed)
+        if clock is not None and clock.s and (clock.is_leap or not lag.s):
+            _LOG.warning(clock.warning)
         if lag.s:
             _LOG.warning(
                 f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show;"
@@ -159,6 +165,17 @@ def survey(
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
     return replace(found, seconds=time.monotonic() - began)
+
+
+def _warn_of_order(array: SensorArray, rows: Readings) -> None:
+    """Warn of sensors whose anomalies are larger than those of sensors below them."""
+    weaker = weaker_sensors_below(array, rows, size_of_anomalies(array, rows))
+    for upper, lower in zip(array.ids, weaker, strict=True):
+        if lower:
+            _LOG.warning(
+                f"sensor {upper} shows larger anomalies than sensor {lower} below it, expected smaller ones: are their"
+                " columns or positions exchanged?"
+            )
 
 
 def tile_rows(

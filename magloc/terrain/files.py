@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -24,11 +25,13 @@ from magloc.terrain.surface import Terrain, interpolate_nodes, interpolate_point
 if TYPE_CHECKING:
     import pyproj
 
+_LOG = logging.getLogger(__name__)
 _WGS84 = "EPSG:4326"
 _EARTH_RADIUS_M = 6.371e6  # its local radii differ by 1 %: 2 mm of height at 1 km
 _MARGIN_M = 20.0  # around the lines
 _WIDE = 4.0  # further margin for points, in their spacings
 _MOST_CHECKED = 20_000  # rows that must lie above the terrain
+_ALIKE, _MOST_SLOPE = 0.7, 2.0  # correlation and ratio of altimeter and height in another unit
 _ALTIMETER_CELL_M = 0.5  # readings of an altimeter in one cell become their median
 _NO_DATA_M = 9999.0  # larger numbers stand for unknown heights, such as -9999 and -32768
 _METRES = {None, "", "m", "metre", "meter", "metres", "meters"}
@@ -270,9 +273,26 @@ def terrain_below(parts: Sequence[Readings], altitudes_m: Sequence[FloatArray], 
     for part, altitude_m in zip(parts, altitudes_m, strict=True):
         if part.array_position_m is None:
             raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
+        _warn_of_unit(part.array_position_m, altitude_m, name)
         places.append(part.array_position_m - altitude_m[:, None] * [0.0, 0.0, 1.0])
     place = np.concatenate(places)
     cells = np.floor(place[:, :2] / _ALTIMETER_CELL_M)
     labels = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     index = np.arange(labels.max() + 1)
     return Terrain.from_points(np.column_stack([median(axis, labels, index) for axis in place.T]), name)
+
+
+def _warn_of_unit(place_m: FloatArray, altitude_m: FloatArray, name: str) -> None:
+    """Warn of an altimeter (n,) that changes by much more than the height of places (n, 3), as one in feet does.
+
+    Where the ground is the same, both change alike; where the carrier follows the ground, the altimeter changes less.
+    """
+    step_m = float(np.median(np.linalg.norm(np.diff(place_m[:, :2], axis=0), axis=1))) if len(place_m) > 1 else 0.0
+    apart = max(1, min(int(_ALTIMETER_CELL_M / step_m), len(place_m) // 2)) if step_m else 1
+    rise_m, more_m = (values[apart:] - values[:-apart] for values in (place_m[:, 2], altitude_m))
+    rise, more = float(np.linalg.norm(rise_m)), float(np.linalg.norm(more_m))
+    if float(rise_m @ more_m) > _ALIKE * rise * more and more > _MOST_SLOPE * rise:
+        _LOG.warning(
+            f"{name} changes by {more / rise:.2f} times the change of the height, expected once at most: is it in"
+            " metres? A foot is 0.3048 m"
+        )

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from arrays.io.errors import InputError, naming, naming_options
-from arrays.typing import Vector
-from magloc.cli.framework import refuse_outside
+from arrays.typing import FloatArray, Vector
+from magloc.cli.framework import note, refuse_outside
 
 if TYPE_CHECKING:
     import arrays
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _FILES = (".tif", ".tiff", ".vrt", ".csv", ".txt", ".xyz")
 _HIGHEST_M = 1e5
+_HIGH_M = 5.0  # above the ground: sensors that find targets are rarely higher
 
 
 @Parameter(name="*", group="Ground")
@@ -96,8 +97,22 @@ class SurfaceOptions:
             ground = read_terrain(self.terrain, np.concatenate(places), origin=origin, crs=crs)
         ground = ground.raise_by(self.ground_m)
         if not above_ground:
+            _note_clearance(ground, np.concatenate(places))
             return ground, parts, origin
         if origin is not None and not origin[2]:
             height_m = float(ground.height_at(np.zeros(2)))
             ground, origin = ground.raise_by(-height_m), (origin[0], origin[1], height_m)
         return ground, [ground.place_above(part) for part in parts], origin
+
+
+def _note_clearance(ground: Terrain, place_m: FloatArray) -> None:
+    """Print a note if places (n, 3) are high above terrain, as they are if both count from different levels."""
+    import numpy as np
+
+    low_m, usual_m = np.nanquantile(-ground.depth_of(place_m), [0.0, 0.5]).tolist()
+    if low_m > _HIGH_M:
+        note(
+            f"note: the log is {low_m:.4g} m or more, and in the median {usual_m:.4g} m, above {ground.name}. If it was"
+            " flown lower, it counts from the ellipsoid and the terrain from the sea: raise the terrain by the"
+            " difference (--ground-m)"
+        )

@@ -34,6 +34,7 @@ LOGS = {
     "several marks": ("! x\n/ t,Mag,B\n0,48.5,1\n!\n1,48.6,2\n2,,3", {"comment": ("!", "/")}),
     "names of lines": ("t,Mag,B\nLine 10\n0,48.5,1\n/L20\n1,48.6,2\n2,,3", {"skip": ("Line", "/L")}),
     "repeated header": ("t,Mag,B\n0,48.5,1\nt,Mag,B\n1,48.6,2\nt,Mag,B\n2,,3\n", {}),
+    "joined files with marks": ("\ufefft,Mag,B\n0,48.5,1\n\ufefft,Mag,B\n1,48.6,2\n\ufeff2,,3\n", {}),
     "row of units": ("t,Mag,B\n[s],nT,\n0,48.5,1\n1,48.6,2\n2,,3\n", {}),
     "separators at the end": ("t;Mag;B;\r\n0;48.5;1;;\r\n1;48.6;2;\r\n2;;3;\r\n", {"separator": "semicolon"}),
     "short rows": ("t,Mag,B,Remark,More\n0,48.5,1,x,y\n1,48.6,2,x\n2,,3,\n", {}),
@@ -80,6 +81,11 @@ class TestRows:
         assert table.line_numbers.tolist() == [6, 8, 9]
         for words in ("header is on line 2", "1 lines of repeated headers", "2 lines of remarks", "row of units"):
             assert words in caplog.text
+
+    def test_another_header(self) -> None:
+        """A logger that was started again with another setting."""
+        with pytest.raises(InputError, match="line 5: found a second header with other columns, expected one header"):
+            read("log\nt,Mag,B\n0,48.5,1\n1,48.6,2\nt,B,Mag\n2,3,48.6\n")
 
     def test_a_row_cut_at_the_end(self, caplog: pytest.LogCaptureFixture) -> None:
         """The battery was empty: the last number may be half of one."""

@@ -265,6 +265,12 @@ class TestFaults:
         assert time_s == pytest.approx(160.0, abs=8.0)
         assert size_nT == pytest.approx(78.0, rel=0.3)
 
+    def test_correlated_residuals_are_no_change(self) -> None:
+        """Errors of the vector sensor's attitude, which the platform's field at the scalar sensor amplifies."""
+        flown = fly(14)
+        found = magloc.compensate(ARRAY, flown.readings, currents={"motor_A": flown.flight.current_A})
+        assert not flagged(found, "change")
+
     @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("lag_s", [0.3, -0.15])
     def test_lag(self, lag_s: float) -> None:

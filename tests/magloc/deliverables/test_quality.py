@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import arrays
 import magloc
@@ -114,6 +115,17 @@ class TestHeadingError:
         assert magloc.check_quality(PAIR, rows).heading == [None, None]
 
 
+class TestOrder:
+    @pytest.mark.usefixtures("without_lag")
+    def test_exchanged_columns(self) -> None:
+        """The field of the ground decays upwards."""
+        quality = checked(lambda values: values[:, ::-1])
+        (check,) = [check for check in quality.checks if check.name == "anomalies" and check.remark]
+        assert check.sensor == "high"
+        assert check.remark == "larger than those of low below it: exchanged?"
+        assert quality.anomalies_T[1] > 2.0 * quality.anomalies_T[0]
+
+
 class TestLag:
     @pytest.mark.parametrize("late", [-2, 2])
     def test_readings_of_other_rows(self, late: int) -> None:
@@ -123,6 +135,31 @@ class TestLag:
         quality = magloc.check_quality(PAIR, rows)
         assert value(quality, "lag") == pytest.approx(1e3 * late / RATE_Hz, abs=4.0 * value(quality, "lag ±") + 5.0)
         assert "lag" in quality.flags
+
+    @pytest.mark.usefixtures("without_lag")
+    def test_places_by_another_clock(self) -> None:
+        """The receiver's clock is 18 s ahead: a reading's place stands 18 s later in the log."""
+        time_s, rng = np.arange(0.0, 400.0, 0.25), np.random.default_rng(56)
+
+        def way(seconds: FloatArray) -> FloatArray:
+            line, along_m = np.divmod(seconds, 25.0)
+            return np.stack([np.where(line % 2, 25.0 - along_m, along_m), 0.5 * line, 0.0 * line + 0.6], axis=-1)
+
+        dipoles_m = rng.uniform([0.0, 0.0, -0.6], [25.0, 8.0, -0.3], (30, 3))
+        fields_T = magloc.dipole.field(way(time_s + 18.0)[:, None], dipoles_m, rng.standard_normal((30, 3))).sum(axis=1)
+        rows = magloc.Readings(
+            np.linalg.norm(fields_T + np.array([0.0, 0.0, 48e-6]), axis=1)[:, None]
+            + 1e-10 * rng.standard_normal((1600, 1)),
+            time_s=time_s,
+            array_position_m=way(time_s),
+            array_rotation=Rotation.identity(1600),
+        )
+        quality = magloc.check_quality(
+            arrays.SensorArray((arrays.Sensor("m", "scalar", (0.0, 0.0, 0.0), 1e-10),)), rows
+        )
+        (check,) = [check for check in quality.checks if check.name == "agreement of lines"]
+        assert check.remark.endswith("% with places 18 s later: GPS time?")
+        assert "agreement of lines" in quality.flags
 
     def test_places_in_another_unit(self, caplog: pytest.LogCaptureFixture) -> None:
         """In mm: no search, a sentence, and the other checks."""
@@ -140,7 +177,8 @@ class TestLag:
     def test_scalar_sensors_without_the_ambient_field(self) -> None:
         quality = magloc.check_quality(PAIR, replace(ROWS, ambient_T=None))
         assert quality.lag is None
-        assert "lag" not in [check.name for check in quality.checks]
+        assert np.isnan(value(quality, "lag"))
+        assert "lag" not in quality.flags
 
 
 class TestGaps:
@@ -154,6 +192,15 @@ class TestGaps:
         assert quality.gaps.duration_s[lost] == pytest.approx(30.0 / RATE_Hz)
         assert value(quality, "way in a gap") == pytest.approx(30.0 * SPEED_M_S / RATE_Hz, rel=1e-3)
         assert quality.flags == ["way in a gap", "widest strip"]
+
+    @pytest.mark.usefixtures("without_lag")
+    @pytest.mark.parametrize(("leap_s", "is_flagged"), [(3600.0, True), (207 * 86400.0, True), (3601.0, False)])
+    def test_a_clock_that_leaps(self, leap_s: float, is_flagged: bool) -> None:
+        """Summer time begins, or day and month change places; a pause ends at any time."""
+        later = leap_s * (np.arange(len(ROWS)) > 5 * PER_LINE + 20)
+        quality = magloc.check_quality(PAIR, replace(ROWS, time_s=ROWS.time_s + later))
+        assert value(quality, "longest gap") == pytest.approx(leap_s + 1.0 / RATE_Hz)
+        assert ("longest gap" in quality.flags) == is_flagged
 
     @pytest.mark.usefixtures("without_lag")
     def test_a_missing_line(self) -> None:

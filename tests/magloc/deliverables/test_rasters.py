@@ -40,6 +40,13 @@ class TestGridRows:
         assert grid_rows(survey.rows, survey.rows.anomaly_T, frame).cell_m == 0.2
         assert grid_rows(survey.rows, survey.rows.anomaly_T, frame, 0.5).cell_m == 0.5
 
+    def test_the_residual_has_no_offset(self, survey: magloc.Survey) -> None:
+        """And both maps still differ by the targets' fields."""
+        levelled = survey.levelled_rows
+        assert abs(np.median(levelled.residual_T)) < 1e-15
+        fields_T = survey.rows.anomaly_T - survey.rows.residual_T
+        np.testing.assert_allclose(levelled.anomaly_T - levelled.residual_T, fields_T, rtol=0.0, atol=1e-15)
+
     def test_corners_are_round_numbers(self, survey: magloc.Survey) -> None:
         """A cell is 0.2 m on the map, although a metre of the ground is 0.9998 m there."""
         raster = grid_rows(survey.rows, survey.rows.anomaly_T, MapFrame((52.41, 13.12, 41.0), "EPSG:32633"))

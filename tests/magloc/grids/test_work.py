@@ -12,6 +12,7 @@ import pytest
 
 from arrays.io.errors import InputError
 from magloc import core
+from magloc.grids import work
 from magloc.grids.work import Arrays, workers
 
 ITEMS = [np.arange(3.0), np.arange(4.0), np.ones(2)]
@@ -67,6 +68,22 @@ class TestWorkers:
             list(each(squared, ITEMS))
             done = dict(each(squared, [ITEMS[0] + 1.0]))
         np.testing.assert_array_equal(done[0]["square"], (ITEMS[0] + 1.0) ** 2)
+
+    def test_results_of_other_code_are_computed_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        def again() -> list[str]:
+            with workers(1, None, tmp_path) as each:
+                list(each(squared, ITEMS))
+            return [record.message for record in caplog.records]
+
+        assert again() == again() == []
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+        monkeypatch.setattr(work, "_code", lambda: "another")
+        (sentence,) = again()
+        assert sentence.endswith("3 finished parts are of another version of magloc, and are computed again")
+        assert len(list(tmp_path.iterdir())) == 6
+        assert before == {path: path.stat().st_mtime_ns for path in before}
 
     @pytest.mark.parametrize("length", [0, 30])
     def test_a_file_that_is_cut_short(self, tmp_path: Path, length: int) -> None:

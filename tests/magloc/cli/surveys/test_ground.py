@@ -97,6 +97,29 @@ class TestTerrain:
         np.testing.assert_allclose(flown, CLEARANCE_M + 0.5, atol=0.05)  # the middle of both sensors
 
     @pytest.mark.usefixtures("without_lag")
+    @pytest.mark.parametrize("down_m", [0.0, 45.0])
+    def test_heights_of_the_ellipsoid_above_a_map_of_the_sea(self, folder: Path, run: Run, down_m: float) -> None:
+        """The sea is 45 m above the ellipsoid: a note names the median height of the lower sensor above the terrain."""
+        line = ("--array", folder / "sea.toml", "--terrain", folder / "dem.tif", "--ground-m", -down_m)
+        done = run("qc", folder / "walk.csv", *line)
+        assert done.status == 0, done.err
+        assert ("raise the terrain by the difference" in done.err) == (down_m > 0.0)
+        assert not down_m or f"in the median {down_m + CLEARANCE_M:.4g} m, above" in done.err
+
+    @pytest.mark.usefixtures("without_lag")
+    @pytest.mark.parametrize("unit_m", [1.0, 0.3048])
+    def test_an_altimeter_in_feet(self, folder: Path, tmp_path: Path, run: Run, unit_m: float) -> None:
+        """Flat ground: the altimeter follows the height of the log, and its unit is told by the ratio."""
+        log = pd.read_csv(folder / "walk.csv")
+        log["H"] = 30.0 + 0.2 * np.sin(0.7 * log["time_s"])
+        noise = 0.02 * np.random.default_rng(5).standard_normal(len(log))
+        log.assign(Above=(log["H"] - 29.0 + noise) / unit_m).to_csv(tmp_path / "walk.csv", index=False)
+        done = run("qc", tmp_path / "walk.csv", "--array", folder / "sea.toml", "--terrain", "Above")
+        assert done.status == 0, done.err
+        assert ("changes by 3." in done.err and "A foot is 0.3048 m" in done.err) == (unit_m < 1.0)
+        assert "is it in metres" not in done.err or unit_m < 1.0
+
+    @pytest.mark.usefixtures("without_lag")
     def test_an_altimeter(self, folder: Path, run: Run) -> None:
         done = run("survey", folder / "walk.csv", "--array", folder / "sea.toml", "--terrain", "Above", "--json")
         assert done.status == 0, done.err
