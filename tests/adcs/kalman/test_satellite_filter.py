@@ -42,6 +42,16 @@ def log_of(rows: Array | slice = slice(None), shift_s: Array | float = 0.0, **ch
     return adcs.Telemetry(times[rows], **{name: each[rows] for name, each in values.items()}, step_s=1.0)
 
 
+def log_with_a_turned_star_tracker() -> adcs.Telemetry:
+    """From the 60th second on the frame of the star tracker is turned by 2°."""
+    scenario = replace(SCENARIO, duration_s=420.0, wild_share=0.0)
+    log = adcs.Telemetry.of(sims.simulate(scenario, 3), SATELLITE.start)
+    star = np.array(log.star)
+    star[60:] = (Rotation.from_rotvec([0.0, math.radians(2.0), 0.0]) * Rotation.from_quat(star[60:])).as_quat()
+    names = READINGS[1:5]
+    return adcs.Telemetry(log.time_s, star=star, **{name: getattr(log, name) for name in names}, step_s=1.0)
+
+
 def updates(
     filter_: adcs.SatelliteFilter, log: adcs.Telemetry, rows: Iterable[int] | None = None
 ) -> list[SatelliteEstimate]:
@@ -106,12 +116,7 @@ class TestAsTheBatch:
 
     def test_where_a_second_hypothesis_wins(self) -> None:
         """The star tracker's frame turns by 2° and stays so: the filter rejects its fixes, and then believes them."""
-        scenario = replace(SCENARIO, duration_s=420.0, wild_share=0.0)
-        log = adcs.Telemetry.of(sims.simulate(scenario, 3), SATELLITE.start)
-        star = np.array(log.star)
-        star[60:] = (Rotation.from_rotvec([0.0, math.radians(2.0), 0.0]) * Rotation.from_quat(star[60:])).as_quat()
-        names = READINGS[1:5]
-        log = adcs.Telemetry(log.time_s, star=star, **{name: getattr(log, name) for name in names}, step_s=1.0)
+        log = log_with_a_turned_star_tracker()
         batch = adcs.estimate(log, SATELLITE, sensors="st+gyro", states=["gyro-bias"])
         assert batch.gated["st"][60:100].all()
         assert not batch.gated["st"][-50:].any()
