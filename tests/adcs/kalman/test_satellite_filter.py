@@ -183,6 +183,48 @@ class TestState:
                 adcs.SatelliteFilter.from_state({**state, **change}, SATELLITE)
 
 
+class TestLateReadings:
+    def test_are_as_in_time(self) -> None:
+        """Star fixes arrive 1 to 5 s late, in any order, some of them at times without other readings."""
+        rng, n = np.random.default_rng(6), 60
+        log, (sensors, states) = log_of(slice(n), np.where(np.arange(241) % 7 == 3, 0.4, 0.0)), SETS[1]
+        in_time = updates(filter_of(sensors, states), log)
+        board = adcs.SatelliteFilter(SATELLITE, sensors=sensors, states=states, step_s=1.0, horizon_s=6.0)
+        due = np.argsort(log.time_s + np.where(rng.random(n) < 0.7, rng.uniform(1.0, 5.0, n), 0.0), kind="stable")
+        alone = np.arange(n) % 7 == 3  # all readings of these times arrive with the star fix
+        arrivals = [(log.time_s[row], row, "others") for row in range(n) if not alone[row]]
+        arrivals += [(log.time_s[row] + rng.uniform(1.0, 5.0), row, "all" if alone[row] else "star") for row in due]
+        for _, row, part in sorted(arrivals):
+            of_star = ("star", "star_covariance_rad2")
+            names = {"star": of_star, "all": READINGS, "others": [name for name in READINGS if name not in of_star]}[
+                part
+            ]
+            latest = board.update(log.time_s[row], **{name: getattr(log, name)[row] for name in names})
+        assert latest.time_s == in_time[-1].time_s
+        assert latest.flags == in_time[-1].flags
+        for name in ("q", "rate_rad_s", "covariance"):
+            np.testing.assert_allclose(getattr(latest, name), getattr(in_time[-1], name), rtol=0, atol=1e-12)
+
+    def test_before_the_horizon_are_refused(self) -> None:
+        log = log_of(slice(30))
+        board = adcs.SatelliteFilter(SATELLITE, sensors="st+gyro", step_s=1.0, horizon_s=5.0)
+        updates(board, log)
+        state, last_s = board.state(), log.time_s[-1]
+        for time_s in (last_s - 6.0, math.nan):
+            with pytest.raises(ValueError, match="must ascend and be finite"):
+                board.update(time_s, gyro_rad_s=[0.0, 1e-3, 0.0])
+        with pytest.raises(ValueError, match="no infinity"):
+            board.update(last_s - 2.0, gyro_rad_s=[math.inf, 0.0, 0.0])
+        assert board.state() == state
+        board.update(last_s - 5.0, gyro_rad_s=[0.0, 1e-3, 0.0])
+        resumed = adcs.SatelliteFilter.from_state(json.loads(json.dumps(board.state())), SATELLITE)
+        assert resumed.horizon_s == 5.0
+        with pytest.raises(ValueError, match="must ascend and be finite; instead received"):
+            resumed.update(last_s - 2.0)
+        resumed.update(last_s + 1.0)
+        resumed.update(last_s + 0.5, gyro_rad_s=[0.0, 1e-3, 0.0])
+
+
 class TestInput:
     @pytest.mark.parametrize(
         ("step_s", "readings", "words"),
