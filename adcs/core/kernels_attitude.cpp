@@ -44,34 +44,35 @@ inline SmallMotion operator*(double scale, const SmallMotion &a) {
   return {scale * a.angles, scale * a.w, scale * a.turned};
 }
 
-inline SmallMotion slope(const Body &body, double orbital_rate, const SmallMotion &x, const Vector<Lanes> &torque) {
+inline SmallMotion slope(const Body<> &body, double orbital_rate, const SmallMotion &x, const Vector<Lanes> &torque) {
   const Vector<Lanes> orbit = {{x.angles[2], broadcast<Lanes>(1.0), -x.angles[0]}};
   return {x.w + orbital_rate * orbit, body.inverse_inertia * (torque - gyroscopic_torque(body, x.w, {})), x.w};
 }
 
-inline FilterModel model_of(const magloc_mekf &p, const Control *feedback) {
-  FilterModel model = {{matrix_at(p.inertia), matrix_at(p.inverse_inertia)},
-                       vector_at(p.residual_dipole),
-                       (int)p.n_states,
-                       {},
-                       {},
-                       feedback};
-  for (int k = 0; k < Optional::count; ++k) model.place[k] = (int)p.place[k];
+inline FilterModel<> model_of(const magloc_mekf &p, const Control<> *feedback) {
+  FilterModel<> model = {{matrix_at(p.inertia), matrix_at(p.inverse_inertia)},
+                         vector_at(p.residual_dipole),
+                         {{(int)p.n_states, {}}},
+                         {},
+                         feedback,
+                         {}};
+  __builtin_memcpy(model.open_variance, p.open_variance, model.n() * sizeof(double));
+  for (int k = 0; k < Optional::count; ++k) model.states.places.place[k] = (int)p.place[k];
   for (int k = 0; k < Sensor::count; ++k) model.variance[k] = p.sigma[k] * p.sigma[k];
   return model;
 }
 
 // row is that of an array (n_runs, n_instants, ...).
-inline Instant instant_at(const magloc_mekf &p, int64_t row) {
+inline Instant<> instant_at(const magloc_mekf &p, int64_t row) {
   return {{vector_at(p.momentum + 3 * row), vector_at(p.wheel_torque + 3 * row)},
           vector_at(p.torquers + 3 * row),
           {p.orbital_rate[row], p.gravity[row], vector_at(p.field_model + 3 * row)},
           vector_at(p.sun_model + 3 * row)};
 }
 
-inline Readings readings_at(const magloc_mekf &p, int64_t row) {
-  Readings readings = {quaternion_at(p.star + 4 * row), matrix_at(p.star_whitening + 9 * row),
-                       vector_at(p.gyro + 3 * row), vector_at(p.field + 3 * row), vector_at(p.sun + 3 * row)};
+inline Readings<> readings_at(const magloc_mekf &p, int64_t row) {
+  Readings<> readings = {quaternion_at(p.star + 4 * row), matrix_at(p.star_whitening + 9 * row),
+                         vector_at(p.gyro + 3 * row), vector_at(p.field + 3 * row), vector_at(p.sun + 3 * row)};
   if (!p.used[Sensor::star_tracker]) readings.star.scalar = nan;
   if (!p.used[Sensor::gyro]) readings.gyro[0] = nan;
   if (!p.used[Sensor::magnetometer]) readings.field[0] = nan;
@@ -79,22 +80,23 @@ inline Readings readings_at(const magloc_mekf &p, int64_t row) {
   return readings;
 }
 
-inline void start(const magloc_mekf &p, const FilterModel &model, int64_t run, GatedFilter &filter) {
-  Estimate first = {{quaternion_at(p.first_q + 4 * run), vector_at(p.first_w + 3 * run)}, {}};
+inline void start(const magloc_mekf &p, const FilterModel<> &model, int64_t run, GatedFilter<> &filter) {
+  Estimate<> first = {{quaternion_at(p.first_q + 4 * run), vector_at(p.first_w + 3 * run)}, {}};
   for (int k = 0; k < Optional::count; ++k)
-    if (model.has(k)) first.optional[k] = vector_at(p.first_optional + run * (model.n - 6) + model.place[k] - 6);
+    if (model.has(k)) first.optional[k] = vector_at(p.first_optional + run * (model.n() - 6) + model.place(k) - 6);
   filter.start(first);
-  for (int i = 0; i < model.n; ++i)
-    for (int j = 0; j < model.n; ++j) filter.main().P()[i][j] = p.first_covariance[(run * model.n + i) * model.n + j];
+  for (int i = 0; i < model.n(); ++i)
+    for (int j = 0; j < model.n(); ++j)
+      filter.main().P()[i][j] = p.first_covariance[(run * model.n() + i) * model.n() + j];
 }
 
-inline void store(const Hypothesis &found, const FilterModel &model, int64_t row, const magloc_mekf &p) {
+inline void store(const Hypothesis<> &found, const FilterModel<> &model, int64_t row, const magloc_mekf &p) {
   store(found.x.motion.q, p.q + 4 * row);
   store(found.x.motion.w, p.w + 3 * row);
   for (int k = 0; k < Optional::count; ++k)
-    if (model.has(k)) store(found.x.optional[k], p.optional + row * (model.n - 6) + model.place[k] - 6);
-  for (int i = 0; i < model.n; ++i)
-    __builtin_memcpy(p.covariance + (row * model.n + i) * model.n, found.P()[i], model.n * sizeof(double));
+    if (model.has(k)) store(found.x.optional[k], p.optional + row * (model.n() - 6) + model.place(k) - 6);
+  for (int i = 0; i < model.n(); ++i)
+    __builtin_memcpy(p.covariance + (row * model.n() + i) * model.n(), found.P()[i], model.n() * sizeof(double));
 }
 MAGLOC_END
 
@@ -105,9 +107,9 @@ MAGLOC_KERNEL(attitude_motion_runs, attitude_motion) {
   Workspace room(workspace);
   auto *iron = room.take<Hysteresis<Lanes>>(p.n_rods);
   if (!workspace) return room.size();
-  const Body body = {matrix_at(p.inertia), matrix_at(p.inverse_inertia)};
-  const Control control = {vector_at(p.attitude_gain), vector_at(p.rate_gain), p.torque_limit, p.momentum_limit,
-                           quaternion_at(p.reference)};
+  const Body<> body = {matrix_at(p.inertia), matrix_at(p.inverse_inertia)};
+  const Control<> control = {vector_at(p.attitude_gain), vector_at(p.rate_gain), p.torque_limit, p.momentum_limit,
+                             quaternion_at(p.reference)};
   const Rods rods = {p.rod_axes, p.n_rods, p.coercivity, p.steepness, p.rod_strength};
   for (int64_t run = begin; run < end; run += n_lanes<Lanes>) {
     const Runs runs(run, end, p.n_instants), rod_runs(run, end, p.n_rods);
@@ -145,7 +147,7 @@ MAGLOC_KERNEL(attitude_motion_runs, attitude_motion) {
 MAGLOC_KERNEL(small_motion_runs, small_motion) {
   if (!workspace) return 0;
   const auto &p = *problem;
-  const Body body = {matrix_at(p.inertia), matrix_at(p.inverse_inertia)};
+  const Body<> body = {matrix_at(p.inertia), matrix_at(p.inverse_inertia)};
   for (int64_t run = begin; run < end; run += n_lanes<Lanes>) {
     const Runs runs(run, end, 1);
     SmallMotion x = {runs.load_vector(p.state, 0, 9), runs.load_vector(p.state, 0, 9, 3),
@@ -172,16 +174,16 @@ MAGLOC_KERNEL(small_motion_runs, small_motion) {
 MAGLOC_KERNEL(mekf_runs, mekf) {
   const auto &p = *problem;
   Workspace room(workspace);
-  auto *filter = room.take<GatedFilter>(1);
+  auto *filter = room.take<GatedFilter<>>(1);
   if (!workspace) return room.size();
-  const Control feedback = {vector_at(p.attitude_gain), vector_at(p.rate_gain), 0.0, 0.0, {}};
-  const FilterModel model = model_of(p, p.has_feedback ? &feedback : nullptr);
-  Gate gate = {p.gate_limit, {}, p.open_variance};
+  const Control<> feedback = {vector_at(p.attitude_gain), vector_at(p.rate_gain), 0.0, 0.0, {}};
+  const FilterModel<> model = model_of(p, p.has_feedback ? &feedback : nullptr);
+  Gate gate = {p.gate_limit, {}};
   for (int k = 0; k < Sensor::count; ++k) gate.patience[k] = p.patience[k];
   const int64_t first = p.n_before > 0 ? p.n_before - 1 : 0;
   for (int64_t row = begin; row < end; ++row) {
-    const int64_t run = row / p.n_instants, i = row % p.n_instants, step = (i - 1) * model.n;
-    const Instant now = instant_at(p, row);
+    const int64_t run = row / p.n_instants, i = row % p.n_instants, step = (i - 1) * model.n();
+    const Instant<> now = instant_at(p, row);
     if (i == 0 && p.n_before > 0) continue;
     if (i == 0)
       start(p, model, run, *filter);

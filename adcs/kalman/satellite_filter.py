@@ -19,7 +19,7 @@ from adcs.kalman.mekf import filter_problem
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part, single_reading
-from arrays.io.errors import check_positive
+from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import FloatArray
 from magloc import core
 from magloc.saved_states import read_sealed, seal
@@ -102,6 +102,9 @@ class SatelliteFilter:
         States besides attitude and rate, as of :func:`adcs.estimate`.
     step_s : float
         Usual time between updates, to which the process noise refers. Longer steps are divided into such ones.
+    horizon_s : float
+        Largest delay of a reading. The filter keeps its states for so long, and repeats the updates after a late
+        reading.
 
     Raises
     ------
@@ -123,9 +126,16 @@ class SatelliteFilter:
     """
 
     def __init__(
-        self, satellite: Satellite, *, sensors: str | EstimatorSettings, states: Iterable[str] = (), step_s: float
+        self,
+        satellite: Satellite,
+        *,
+        sensors: str | EstimatorSettings,
+        states: Iterable[str] = (),
+        step_s: float,
+        horizon_s: float = 0.0,
     ) -> None:
         check_positive(step_s=step_s)
+        check_not_negative(horizon_s=horizon_s)
         inertia = satellite.body.inertia_kgm2
         chosen = (
             sensors
@@ -140,9 +150,9 @@ class SatelliteFilter:
                 f"Input sensors must be st or mag+sun, or more; instead received {used.sensors}, which determines no "
                 "attitude at one instant. Use adcs.estimate on a log."
             )
-        self.satellite, self.step_s = satellite, float(step_s)
+        self.satellite, self.step_s, self.horizon_s = satellite, float(step_s), float(horizon_s)
         self.settings, self.longest_gap_s = chosen.settings, chosen.longest_gap_s
-        self._progress = _Progress()
+        self._progress, self._replay = _Progress(), tuple[_Taken, ...]()
 
     def update(
         self,
@@ -161,8 +171,9 @@ class SatelliteFilter:
         Parameters
         ----------
         time_s : float
-            Time since :attr:`adcs.Satellite.start`, later than the one before. After a gap that is longer than
-            ``longest_gap_s`` of the settings, 600 s, the filter starts anew.
+            Time since :attr:`adcs.Satellite.start`, later than the one before, or a late reading's, at most
+            ``horizon_s`` before. Late readings of the time of an update join the others of it. After a gap that is
+            longer than ``longest_gap_s`` of the settings, 600 s, the filter starts anew.
         star, star_covariance_rad2, gyro_rad_s, field_T, sun : optional
             Readings as in a row of :class:`adcs.Telemetry`. None, and a reading with a component that is NaN, is
             missing.
@@ -172,15 +183,51 @@ class SatelliteFilter:
         Returns
         -------
         SatelliteEstimate
-            Attitude with its covariance and flags.
+            Attitude with its covariance and flags, at the latest time so far.
 
         Raises
         ------
         ValueError
-            The time does not ascend, a reading is infinite, has no direction or another shape, a field is larger than
-            1 T, or the filter diverges. The filter is then as before the call.
+            The time does not ascend and is not within the horizon, a reading is infinite, has no direction or another
+            shape, a field is larger than 1 T, or the filter diverges. The filter is then as before the call.
         """
-        time_s, before = float(time_s), self._progress
+        given = (star, gyro_rad_s, field_T, sun, wheels_Nms, torquers_Am2)
+        readings = {name: _reading(name, value) for name, value in zip(_COLUMNS, given, strict=True)}
+        covariance = single_reading("star_covariance_rad2", star_covariance_rad2, (3, 3))
+        before, rows = self._progress, [_Row(float(time_s), readings, covariance)]
+        kept = self._replay
+        if rows[0].time_s <= before.last_s:
+            before, rows, kept = self._rows_with_late(rows[0])
+        for row in rows:
+            kept = (*kept, _Taken(before, row))
+            before, estimate = self._take(before, row)
+        self._progress = before
+        self._replay = tuple(
+            one for one in kept if self.horizon_s > 0.0 and one.row.time_s >= before.last_s - self.horizon_s
+        )
+        return estimate
+
+    def _rows_with_late(self, late: _Row) -> tuple[_Progress, list[_Row], tuple[_Taken, ...]]:
+        """Return the state before a late row, that row and those after it, and the replay buffer before it."""
+        since_s = self._progress.last_s - self.horizon_s
+        later = [one for one in self._replay if one.row.time_s >= late.time_s]
+        if not (later and late.time_s >= since_s and late.time_s > later[0].before.last_s):
+            reach = (
+                f", or be a late one's after {max(since_s, self._replay[0].before.last_s):.17g} s"
+                if self._replay
+                else ""
+            )
+            raise ValueError(
+                f"Input time_s must ascend and be finite{reach}; instead received {late.time_s:.17g} s after "
+                f"{self._progress.last_s:.17g} s. Skip the row."
+            )
+        rows = [one.row for one in later]
+        rows = [rows[0].join(late), *rows[1:]] if rows[0].time_s == late.time_s else [late, *rows]
+        return later[0].before, rows, self._replay[: len(self._replay) - len(later)]
+
+    def _take(self, before: _Progress, row: _Row) -> tuple[_Progress, SatelliteEstimate]:
+        """Return the state and the estimate after a row."""
+        time_s = row.time_s
         if not (math.isfinite(time_s) and time_s > before.last_s):
             raise ValueError(
                 f"Input time_s must ascend and be finite; instead received {time_s:.17g} s after "
@@ -189,29 +236,36 @@ class SatelliteFilter:
         is_late = time_s - before.last_s > max(self.longest_gap_s, self.step_s)
         if is_late:
             before = _Progress()
-        given = (star, gyro_rad_s, field_T, sun, wheels_Nms, torquers_Am2)
-        row = {name: _reading(name, value) for name, value in zip(_COLUMNS, given, strict=True)}
-        record = self._record(time_s, before, row, star_covariance_rad2)
+        record = self._record(time_s, before, row.readings, row.star_covariance_rad2)
         seen = np.array([there[0, -1] for there in record.readings.seen.values()])
         after = replace(
             before,
             first_s=before.first_s if math.isfinite(before.last_s) else time_s,
             last_s=time_s,
-            wheels_Nms=_latest(row["wheels_Nms"], before.wheels_Nms),
-            torquers_Am2=_latest(row["torquers_Am2"], before.torquers_Am2),
+            wheels_Nms=_latest(row.readings["wheels_Nms"], before.wheels_Nms),
+            torquers_Am2=_latest(row.readings["torquers_Am2"], before.torquers_Am2),
             read_s=np.where(seen | ~np.isfinite(before.read_s), time_s, before.read_s),
         )
         after, tracks = self._filter(record, after)
-        self._progress, started = after, bool(self._progress.n_taken)
-        return self._estimate(record, after, tracks, is_restarted=is_late and started)
+        return after, self._estimate(record, after, tracks, is_restarted=is_late and bool(after.n_taken))
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the filter, for a JSON file and :meth:`from_state`."""
+        """Return the state of the filter, for a JSON file and :meth:`from_state`.
+
+        It does not contain earlier states, so readings from before it cannot be late ones after a restart.
+        """
         now = self._progress
         counts = np.array([now.first_s, now.last_s, now.n_taken])
         content = np.concatenate([counts, now.wheels_Nms, now.torquers_Am2, now.read_s, now.memory]).tobytes()
         settings = asdict(self.settings)
-        return seal(_VERSION, content, settings=settings, step_s=self.step_s, longest_gap_s=self.longest_gap_s)
+        return seal(
+            _VERSION,
+            content,
+            settings=settings,
+            step_s=self.step_s,
+            longest_gap_s=self.longest_gap_s,
+            horizon_s=self.horizon_s,
+        )
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], satellite: Satellite) -> SatelliteFilter:
@@ -235,7 +289,7 @@ class SatelliteFilter:
             sensors = SensorSet(**{**saved["sensors"], "states": tuple(saved["sensors"]["states"])})
             settings = FilterSettings(**{**saved, "sensors": sensors, "noise": ProcessNoise(**saved["noise"])})
             chosen = EstimatorSettings(settings, longest_gap_s=float(state["longest_gap_s"]))
-            found = cls(satellite, sensors=chosen, step_s=state["step_s"])
+            found = cls(satellite, sensors=chosen, step_s=state["step_s"], horizon_s=state.get("horizon_s", 0.0))
             numbers_ = np.frombuffer(content, dtype=np.float64)
             first_s, last_s, n_taken = numbers_[:3]
             wheels, torquers, read_s, memory = np.split(numbers_[3:], [3, 6, 6 + len(SENSORS)])
@@ -331,6 +385,29 @@ class _Progress:
     torquers_Am2: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     read_s: FloatArray = field(default_factory=lambda: np.full(len(SENSORS), np.nan))  # last reading of each sensor
     memory: FloatArray = field(default_factory=lambda: np.zeros(0))  # of the kernel
+
+
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """Readings of a time, NaN where missing."""
+
+    time_s: float
+    readings: Mapping[str, FloatArray]
+    star_covariance_rad2: FloatArray
+
+    def join(self, late: _Row) -> _Row:
+        """Return the row with late readings of the same time in place of its own."""
+        readings = {name: _latest(values, self.readings[name]) for name, values in late.readings.items()}
+        has_star = not np.isnan(late.readings["star"]).any()
+        return _Row(self.time_s, readings, (late if has_star else self).star_covariance_rad2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Taken:
+    """Row, and the state of the filter before it."""
+
+    before: _Progress
+    row: _Row
 
 
 def _reading(name: str, value: Any) -> FloatArray:

@@ -60,8 +60,9 @@ Magnet locate(const double (&readings)[n_sensors][3]) {
 
 // Move the filter on by dt. Take what gyro, magnetometer and Sun sensor then read, but
 // not what fits so badly as a good reading does once in a million.
-void take_step(Hypothesis &filter, const FilterModel &satellite, const Instant &before,
-               const Instant &now, const Readings &readings, double dt) {
+void take_step(Hypothesis<> &filter, const FilterModel<> &satellite,
+               const Instant<> &before, const Instant<> &now,
+               const Readings<> &readings, double dt) {
   const double kept[6] = {1.0, 1.0, 1.0, 1.0, 1.0, 1.0},
                growth[6] = {1e-12, 1e-12, 1e-12, 1e-12, 1e-12, 1e-12};
   filter.predict(satellite, before, now, kept, growth, dt);
@@ -90,24 +91,23 @@ int main() {
 
   const double inertia[9] = {0.05, 0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0, 0.03};
   const double inverse[9] = {20.0, 0.0, 0.0, 0.0, 1 / 0.06, 0.0, 0.0, 0.0, 1 / 0.03};
-  FilterModel satellite = {};
+  FilterModel<> satellite = {};
   satellite.body = {matrix_at(inertia), matrix_at(inverse)};
-  satellite.n = 6;  // attitude and rate, no optional states
-  for (int &place : satellite.place) place = -1;
-  satellite.variance[Sensor::gyro] = 1e-8;           // (rad/s)^2
+  satellite.states.places = places_of<>();  // attitude and rate, no optional states
+  satellite.variance[Sensor::gyro] = 1e-8;  // (rad/s)^2
   satellite.variance[Sensor::magnetometer] = 4e-14;  // T^2
   satellite.variance[Sensor::sun_sensor] = 2.5e-5;   // of a unit vector
-  Instant instant = {};
+  Instant<> instant = {};
   instant.wheels.momentum = {{1e-3, -2e-3, 5e-4}};
   instant.around.orbital_rate = 1.1e-3;
   instant.around.gravity = 1.2e-6;  // mu/r^3
   instant.around.field = {{2e-5, 1e-6, -3e-5}};
   instant.sun = {{0.6, 0.0, 0.8}};
-  Readings readings = {};
+  Readings<> readings = {};
   readings.gyro = {{1e-3, 2e-3, -1e-3}};
   readings.field = {{1.9e-5, 2.1e-6, -3.1e-5}};
   readings.sun = {{0.61, 0.02, 0.79}};
-  static Hypothesis filter;
+  static Hypothesis<> filter;
   filter.start({{identity, {{0.0, 1.1e-3, 0.0}}}, {}});
   for (int i = 0; i < 6; ++i) filter.P()[i][i] = i < 3 ? 1e-3 : 1e-5;
   take_step(filter, satellite, instant, instant, readings, 1.0);

@@ -21,7 +21,11 @@ COMMANDS = (
     ("bounds", "magloc.cli.bounds:bounds", "Compute Cramér-Rao bounds, and how far an array reaches."),
     ("design", "magloc.cli.design:design", "Optimise the positions of an array's sensors."),
     ("new-array", "magloc.cli.first_steps.new_array:new_array", "Write an array file."),
-    ("export-config", "magloc.cli.first_steps.export_config:export_config", "Write an array as a C++ header."),
+    (
+        "export-config",
+        "magloc.cli.first_steps.export_config:export_config",
+        "Write an array or satellite as a C++ header.",
+    ),
     ("columns", "magloc.cli.first_steps.columns:columns", "Propose how to read the log of another program."),
     ("qc", "magloc.cli.surveys.qc:qc", "Check the quality of a field log."),
     ("survey", "magloc.cli.surveys.survey:survey", "Find targets at rest in the ground."),

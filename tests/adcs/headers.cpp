@@ -28,8 +28,8 @@ void closed_loop_jacobian(const double *inertia, const double *inverse, const do
     for (int j = 0; j < 6; ++j) out[6 * j + i] = F[i][j];
 }
 // One step of a filter, as a microcontroller calls it.
-void filter_step(Hypothesis *filter, const FilterModel *model, const Instant *now, const Instant *next,
-                 const Readings *readings, const double *kept, const double *added_variance, double dt) {
+void filter_step(Hypothesis<> *filter, const FilterModel<> *model, const Instant<> *now, const Instant<> *next,
+                 const Readings<> *readings, const double *kept, const double *added_variance, double dt) {
   filter->predict(*model, *now, *next, kept, added_variance, dt);
   filter->begin_readings();
   for (int sensor = 0; sensor < Sensor::count; ++sensor)

@@ -106,7 +106,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "robot.ulg --out out.toml",
         "robot.ulg --rest out",
     ),
-    "magloc export-config": ("array.toml --to header", "array.toml --out out.hpp"),
+    "magloc export-config": ("array.toml --to header", "array.toml --out out.hpp", "scenario.toml --out out.hpp"),
     "magloc demo": ("out",),
     "magloc warm-up": ("",),
     "adcs demo": ("out",),

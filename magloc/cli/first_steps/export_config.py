@@ -1,11 +1,13 @@
-"""``magloc export-config``: an array as a C++ header for a microcontroller."""
+"""``magloc export-config``: an array, or the filter of a satellite, as a C++ header for a microcontroller."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import arrays
+from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from magloc.cli.framework import QuietOptions, note
@@ -24,14 +26,15 @@ def export_config(
     out: Path | None = None,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen; the framework reads it
 ) -> None:
-    """Write the sensors of an array as a C++ header: positions, gains, offsets and noise.
+    """Write the sensors of an array, or the filter of a satellite, as a C++ header.
 
-    The header needs no other file, and has SI units.
+    The header of an array has positions, gains, offsets and noise, and needs no other file. That of a satellite has
+    inertia, sensors, noise and states, for ``adcs/satellite_filter.hpp``. Units are SI.
 
     Parameters
     ----------
     array : Path
-        Array file (TOML).
+        Array file (TOML), or scenario of a satellite (TOML, or the name of a built-in one).
     to : str
         Format: a C++ header.
     out : Path, optional
@@ -40,12 +43,30 @@ def export_config(
         Common options.
     """
     refuse_unwritable(out, "--out", ".hpp")
-    header = array_header(arrays.read_array(array))
+    header = _satellite_header(str(array)) if _is_satellite(array) else array_header(arrays.read_array(array))
     if out is None:
         print(header, end="")
         return
     write_text(header, out)
     note(f"wrote {out}")
+
+
+# adcs stands above this package, so it is imported by name, and only for a satellite.
+def _is_satellite(file: Path) -> bool:
+    """Return whether a file is the scenario of a satellite."""
+    if not file.suffix:
+        return str(file) in import_module("adcs.io.scenario_files").built_in_scenarios()
+    from arrays.io.toml import read_toml
+
+    return "satellite" in read_toml(file, "an array, or the scenario of a satellite")
+
+
+def _satellite_header(scenario: str) -> str:
+    """Return a C++ header with the filter of a satellite."""
+    file = import_module("adcs.io.scenario_files").read_scenario(scenario)
+    with naming(scenario):
+        board = import_module("adcs").SatelliteFilter(file.satellite, sensors=file.estimator(), step_s=file.step_s)
+        return str(import_module("adcs.kalman.config_header").satellite_header(file.name, board))
 
 
 def array_header(array: SensorArray) -> str:

@@ -7,7 +7,6 @@ import math
 import os
 import re
 import shutil
-import subprocess
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from adcs.io.imu_files import read_imu
 from magloc import core
 from tests.adcs.complementary.inertial.units import unit_log
 from tests.adcs.complementary.test_imu_recordings import BROAD
+from tests.sanitized import check_random_updates
 
 Array = NDArray[np.float64]
 HEADERS = core.include_dir() / "adcs"
@@ -292,25 +292,7 @@ class TestConfig:
             adcs.AttitudeConfig(magnet="left")  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module")
-def random_updates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A program that updates filters at random, with sanitizers where the compiler has them."""
-    if COMPILER is None:
-        pytest.skip("no C++ compiler")
-    program = tmp_path_factory.mktemp("random") / "random_updates"
-    command = [COMPILER, "-std=c++17", "-O0", f"-I{core.include_dir()}", "-Wall", "-Wextra", "-Werror"]
-    source = [str(Path(__file__).with_name("random_updates.cpp")), "-o", str(program)]
-    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    if subprocess.run([*command, *sanitizers, *source], check=False, capture_output=True).returncode:
-        subprocess.run([*command, *source], check=True)
-    return program
-
-
 @pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
-def test_random_updates_never_crash(random_updates: Path, count: int) -> None:
+def test_random_updates_never_crash(count: int, tmp_path: Path) -> None:
     """NaN, infinities, numbers of any size and times that go back, in double and float."""
-    done = subprocess.run([random_updates, str(count)], check=True, capture_output=True, encoding="utf-8")
-    words = dict(line.split() for line in done.stdout.splitlines())
-    assert int(words["updates"]) == 2 * count
-    assert int(words["refused"]) > count // 10
-    assert int(words["not_finite"]) == 0
+    check_random_updates(Path(__file__).with_name("random_updates.cpp"), count, tmp_path)

@@ -48,6 +48,16 @@ def log_of(rows: Array | slice = slice(None), shift_s: Array | float = 0.0, **ch
     return adcs.Telemetry(times[rows], **{name: each[rows] for name, each in values.items()}, step_s=1.0)
 
 
+def log_with_a_turned_star_tracker() -> adcs.Telemetry:
+    """From the 60th second on the frame of the star tracker is turned by 2°."""
+    scenario = replace(SCENARIO, duration_s=420.0, wild_share=0.0)
+    log = adcs.Telemetry.of(sims.simulate(scenario, 3), SATELLITE.start)
+    star = np.array(log.star)
+    star[60:] = (Rotation.from_rotvec([0.0, math.radians(2.0), 0.0]) * Rotation.from_quat(star[60:])).as_quat()
+    names = READINGS[1:5]
+    return adcs.Telemetry(log.time_s, star=star, **{name: getattr(log, name) for name in names}, step_s=1.0)
+
+
 def updates(
     filter_: adcs.SatelliteFilter, log: adcs.Telemetry, rows: Iterable[int] | None = None
 ) -> list[SatelliteEstimate]:
@@ -116,12 +126,7 @@ class TestAsTheBatch:
 
     def test_where_a_second_hypothesis_wins(self) -> None:
         """The star tracker's frame turns by 2° and stays so: the filter rejects its fixes, and then believes them."""
-        scenario = replace(SCENARIO, duration_s=420.0, wild_share=0.0)
-        log = adcs.Telemetry.of(sims.simulate(scenario, 3), SATELLITE.start)
-        star = np.array(log.star)
-        star[60:] = (Rotation.from_rotvec([0.0, math.radians(2.0), 0.0]) * Rotation.from_quat(star[60:])).as_quat()
-        names = READINGS[1:5]
-        log = adcs.Telemetry(log.time_s, star=star, **{name: getattr(log, name) for name in names}, step_s=1.0)
+        log = log_with_a_turned_star_tracker()
         batch = adcs.estimate(log, SATELLITE, sensors="st+gyro", states=["gyro-bias"])
         assert batch.gated["st"][60:100].all()
         assert not batch.gated["st"][-50:].any()
@@ -207,6 +212,48 @@ def used_state() -> dict[str, Any]:
     filter_ = adcs.SatelliteFilter(SATELLITE, sensors=chosen, step_s=1.0)
     updates(filter_, log_of(slice(50)))
     return filter_.state()
+
+
+class TestLateReadings:
+    def test_are_as_in_time(self) -> None:
+        """Star fixes arrive 1 to 5 s late, in any order, some of them at times without other readings."""
+        rng, n = np.random.default_rng(6), 60
+        log, (sensors, states) = log_of(slice(n), np.where(np.arange(241) % 7 == 3, 0.4, 0.0)), SETS[1]
+        in_time = updates(filter_of(sensors, states), log)
+        board = adcs.SatelliteFilter(SATELLITE, sensors=sensors, states=states, step_s=1.0, horizon_s=6.0)
+        due = np.argsort(log.time_s + np.where(rng.random(n) < 0.7, rng.uniform(1.0, 5.0, n), 0.0), kind="stable")
+        alone = np.arange(n) % 7 == 3  # all readings of these times arrive with the star fix
+        arrivals = [(log.time_s[row], row, "others") for row in range(n) if not alone[row]]
+        arrivals += [(log.time_s[row] + rng.uniform(1.0, 5.0), row, "all" if alone[row] else "star") for row in due]
+        for _, row, part in sorted(arrivals):
+            of_star = ("star", "star_covariance_rad2")
+            names = {"star": of_star, "all": READINGS, "others": [name for name in READINGS if name not in of_star]}[
+                part
+            ]
+            latest = board.update(log.time_s[row], **{name: getattr(log, name)[row] for name in names})
+        assert latest.time_s == in_time[-1].time_s
+        assert latest.flags == in_time[-1].flags
+        for name in ("q", "rate_rad_s", "covariance"):
+            np.testing.assert_allclose(getattr(latest, name), getattr(in_time[-1], name), rtol=0, atol=1e-12)
+
+    def test_before_the_horizon_are_refused(self) -> None:
+        log = log_of(slice(30))
+        board = adcs.SatelliteFilter(SATELLITE, sensors="st+gyro", step_s=1.0, horizon_s=5.0)
+        updates(board, log)
+        state, last_s = board.state(), log.time_s[-1]
+        for time_s in (last_s - 6.0, math.nan):
+            with pytest.raises(ValueError, match="must ascend and be finite"):
+                board.update(time_s, gyro_rad_s=[0.0, 1e-3, 0.0])
+        with pytest.raises(ValueError, match="no infinity"):
+            board.update(last_s - 2.0, gyro_rad_s=[math.inf, 0.0, 0.0])
+        assert board.state() == state
+        board.update(last_s - 5.0, gyro_rad_s=[0.0, 1e-3, 0.0])
+        resumed = adcs.SatelliteFilter.from_state(json.loads(json.dumps(board.state())), SATELLITE)
+        assert resumed.horizon_s == 5.0
+        with pytest.raises(ValueError, match="must ascend and be finite; instead received"):
+            resumed.update(last_s - 2.0)
+        resumed.update(last_s + 1.0)
+        resumed.update(last_s + 0.5, gyro_rad_s=[0.0, 1e-3, 0.0])
 
 
 class TestInput:

@@ -8,11 +8,9 @@
 #pragma once
 #include "adcs/field_heading.hpp"
 #include "adcs/level.hpp"
+#include "adcs/status.hpp"
 
 MAGLOC_BEGIN
-// What a call did. Only ok changes the filter.
-enum class Status : int32_t { ok, bad_time, bad_gyro, bad_acceleration, bad_field };
-
 template <class Real>
 struct AttitudeConfig {
   HeadingParameters<Real> model;
@@ -319,5 +317,4 @@ using magloc::AttitudeConfig;
 using magloc::AttitudeEstimate;
 using magloc::AttitudeFilter;
 using magloc::Disturbance;
-using magloc::Status;
 }  // namespace adcs

@@ -4,8 +4,9 @@
 #include "magloc/elementary.hpp"
 
 MAGLOC_BEGIN
+template <class Real = double>
 struct Body {
-  Matrix inertia, inverse_inertia;
+  MatrixOf<Real> inertia, inverse_inertia;
 };
 
 // The attitude, orbital from body, and the rate against inertial space in body axes.
@@ -35,21 +36,21 @@ MAGLOC_INLINE Vector<T> relative_rate(const Motion<T> &motion, T orbital_rate) {
 }
 
 // The torque of the gravity gradient and of a dipole.
-template <class T>
-MAGLOC_INLINE Vector<T> environment_torque(const Body &body, const Vector<T> &dipole, const Quaternion<T> &q,
+template <class Real, class T>
+MAGLOC_INLINE Vector<T> environment_torque(const Body<Real> &body, const Vector<T> &dipole, const Quaternion<T> &q,
                                            const Surroundings<T> &around) {
   const Vector<T> eta = axis_back(q, 2);
   return 3.0 * around.gravity * cross(eta, body.inertia * eta) + cross(dipole, rotate_back(q, around.field));
 }
 
-template <class T>
-MAGLOC_INLINE Vector<T> gyroscopic_torque(const Body &body, const Vector<T> &w, const Vector<T> &momentum) {
+template <class Real, class T>
+MAGLOC_INLINE Vector<T> gyroscopic_torque(const Body<Real> &body, const Vector<T> &w, const Vector<T> &momentum) {
   return cross(w, momentum + body.inertia * w);
 }
 
 // The rate of change of a motion under a torque from outside besides those of the surroundings.
-template <class T>
-MAGLOC_INLINE Motion<T> slope(const Body &body, const Vector<T> &dipole, const Motion<T> &motion,
+template <class Real, class T>
+MAGLOC_INLINE Motion<T> slope(const Body<Real> &body, const Vector<T> &dipole, const Motion<T> &motion,
                               const Wheels<T> &wheels, const Vector<T> &torque, const Surroundings<T> &around) {
   const Vector<T> outside = torque + environment_torque(body, dipole, motion.q, around);
   const Vector<T> gyroscopic = gyroscopic_torque(body, motion.w, wheels.momentum);
@@ -58,8 +59,8 @@ MAGLOC_INLINE Motion<T> slope(const Body &body, const Vector<T> &dipole, const M
 }
 
 // One step of the classical Runge-Kutta method; torques, dipole and surroundings are held.
-template <class T>
-MAGLOC_INLINE void step(const Body &body, const Vector<T> &dipole, Motion<T> &motion, Wheels<T> &wheels,
+template <class Real, class T>
+MAGLOC_INLINE void step(const Body<Real> &body, const Vector<T> &dipole, Motion<T> &motion, Wheels<T> &wheels,
                         const Vector<T> &torque, const Surroundings<T> &around, double dt) {
   const Vector<T> first_momentum = wheels.momentum;
   const double part[4] = {0.0, 0.5 * dt, 0.5 * dt, dt}, weight[4] = {dt / 6.0, dt / 3.0, dt / 3.0, dt / 6.0};
@@ -77,10 +78,11 @@ MAGLOC_INLINE void step(const Body &body, const Vector<T> &dipole, Motion<T> &mo
 }
 
 // Proportional-derivative control of the wheels towards an attitude that rests in the orbital frame.
+template <class Real = double>
 struct Control {
-  Vector<double> attitude_gain, rate_gain;
-  double torque_limit, momentum_limit;
-  Quaternion<double> reference;
+  Vector<Real> attitude_gain, rate_gain;
+  Real torque_limit, momentum_limit;
+  Quaternion<Real> reference;
 };
 
 template <class T>
@@ -90,8 +92,8 @@ MAGLOC_INLINE T clipped(T x, double limit) {
 
 // The torque of the wheels until the next instant, within the limits of torque and momentum. The readable form is in
 // tests/adcs/attitudes.py.
-template <class T>
-MAGLOC_INLINE Vector<T> commanded_torque(const Body &body, const Control &control, const Motion<T> &motion,
+template <class Real, class T>
+MAGLOC_INLINE Vector<T> commanded_torque(const Body<Real> &body, const Control<Real> &control, const Motion<T> &motion,
                                          const Vector<T> &momentum, T orbital_rate, double dt) {
   const Quaternion<T> reference = {broadcast<T>(control.reference.scalar), broadcast<T>(control.reference.vector)};
   const Vector<T> angle = error_vector(reference, motion.q), rate = relative_rate(motion, orbital_rate);
@@ -140,37 +142,38 @@ inline Vector<T> follow_field(const Rods &rods, const Vector<T> &field, Hysteres
 
 // The transposed Jacobian of the error's rate of change: row i is the rate (6) by the unit error i, with two zeros
 // more. The error is (dq, dw) with half angles dq; the torque of the wheels is known.
-inline void transposed_error_jacobian(const Body &body, const Vector<double> &dipole, const Motion<double> &motion,
-                                      const Vector<double> &momentum, const Surroundings<double> &around,
-                                      double (&F)[6][8]) {
-  const Vector<double> eta = axis_back(motion.q, 2), J_eta = body.inertia * eta;
-  const Vector<double> b = rotate_back(motion.q, around.field), total = momentum + body.inertia * motion.w;
+template <class Real>
+inline void transposed_error_jacobian(const Body<Real> &body, const Vector<Real> &dipole, const Motion<Real> &motion,
+                                      const Vector<Real> &momentum, const Surroundings<Real> &around, Real (&F)[6][8]) {
+  const Vector<Real> eta = axis_back(motion.q, 2), J_eta = body.inertia * eta;
+  const Vector<Real> b = rotate_back(motion.q, around.field), total = momentum + body.inertia * motion.w;
   for (int i = 0; i < 3; ++i) {
-    const Vector<double> e = unit_vector<double>(i), d_eta = cross(eta, e), turned = cross(e, motion.w);
-    const Vector<double> gradient = cross(d_eta, J_eta) + cross(eta, body.inertia * d_eta);
-    const Vector<double> torque = 6.0 * around.gravity * gradient + 2.0 * cross(dipole, cross(b, e));
-    const Vector<double> by_attitude = body.inverse_inertia * torque;
-    const Vector<double> gyroscopic = cross(total, e) - cross(motion.w, body.inertia * e);
-    const Vector<double> by_rate = body.inverse_inertia * gyroscopic;
+    const Vector<Real> e = unit_vector<Real>(i), d_eta = cross(eta, e), turned = cross(e, motion.w);
+    const Vector<Real> gradient = cross(d_eta, J_eta) + cross(eta, body.inertia * d_eta);
+    const Vector<Real> torque = 6.0 * around.gravity * gradient + 2.0 * cross(dipole, cross(b, e));
+    const Vector<Real> by_attitude = body.inverse_inertia * torque;
+    const Vector<Real> gyroscopic = cross(total, e) - cross(motion.w, body.inertia * e);
+    const Vector<Real> by_rate = body.inverse_inertia * gyroscopic;
     for (int j = 0; j < 3; ++j) {
       F[i][j] = turned[j];
       F[i][3 + j] = by_attitude[j];
-      F[3 + i][j] = 0.5 * e[j];
+      F[3 + i][j] = Real(0.5) * e[j];
       F[3 + i][3 + j] = by_rate[j];
     }
   }
-  for (auto &row : F) row[6] = row[7] = 0.0;
+  for (auto &row : F) row[6] = row[7] = 0;
 }
 
 // The same as the source paper has it: the torque of the wheels is that of a control which sees the true attitude,
 // against the orbital frame, and rate. That is wrong, and here to reproduce the paper.
-inline void transposed_closed_loop_jacobian(const Body &body, const Control &control, const Motion<double> &motion,
-                                            double gravity, double (&F)[6][8]) {
-  transposed_error_jacobian(body, {}, motion, {}, {0.0, gravity, {}}, F);
-  const double sign = motion.q.scalar < 0.0 ? -1.0 : 1.0;
+template <class Real>
+inline void transposed_closed_loop_jacobian(const Body<Real> &body, const Control<Real> &control,
+                                            const Motion<Real> &motion, Real gravity, Real (&F)[6][8]) {
+  transposed_error_jacobian<Real>(body, {}, motion, {}, {0, gravity, {}}, F);
+  const Real sign = motion.q.scalar < 0 ? -1 : 1;
   for (int i = 0; i < 3; ++i) {
-    const Vector<double> e = unit_vector<double>(i);
-    Vector<double> by_attitude = sign * (motion.q.scalar * e + cross(motion.q.vector, e)), by_rate = e;
+    const Vector<Real> e = unit_vector<Real>(i);
+    Vector<Real> by_attitude = sign * (motion.q.scalar * e + cross(motion.q.vector, e)), by_rate = e;
     for (int j = 0; j < 3; ++j) by_attitude[j] *= control.attitude_gain[j], by_rate[j] *= control.rate_gain[j];
     by_attitude = body.inverse_inertia * by_attitude, by_rate = body.inverse_inertia * by_rate;
     for (int j = 0; j < 3; ++j) F[i][3 + j] -= by_attitude[j], F[3 + i][3 + j] = -by_rate[j];

@@ -13,7 +13,6 @@ struct ContestRules {
 struct Gate {
   double limit;                     // largest eased NIS of a reading that is used
   int64_t patience[Sensor::count];  // instants
-  const double *open_variance;      // (n) of an error state of which nothing is known
 };
 
 // The counts by which the main hypothesis and the second one, where there is one, are compared.
@@ -68,7 +67,8 @@ class Contest {
   }
 
   // Return whether a rejected reading can begin a second hypothesis; both: field and Sun are read at this instant.
-  bool may_begin(const Gate &gate, const FilterModel &model, int sensor, bool both) const {
+  template <class Model>
+  bool may_begin(const Gate &gate, const Model &model, int sensor, bool both) const {
     if (has_second() || (sensor == Sensor::gyro && !model.has(Optional::gyro_bias))) return false;
     return sensor == Sensor::star_tracker || sensor == Sensor::gyro || both || waited(gate, sensor);
   }
@@ -122,40 +122,49 @@ class Contest {
 
 inline bool is_finite(double x) { return x - x == 0.0; }
 
-// The attitude after the turn about a unit axis that brings a direction nearest to that of the reference frame.
-inline Quaternion<double> turned_about(const Quaternion<double> &q, const Vector<double> &axis,
-                                       const Vector<double> &body, const Vector<double> &reference) {
-  const Vector<double> there = rotate_back(q, reference);
-  const double sine = dot(axis, cross(body, there)), cosine = dot(body, there) - dot(axis, body) * dot(axis, there);
+// The attitude after the turn about a unit axis by an angle of which a length times sine and cosine are known.
+template <class T>
+inline Quaternion<T> turned_by(const Quaternion<T> &q, const Vector<T> &axis, T sine, T cosine) {
   // tan(a/2) = sin(a)/(1 + cos(a)) = (1 - cos(a))/sin(a): of both the one that does not cancel.
-  const double length = square_root(sine * sine + cosine * cosine);
-  Quaternion<double> turn = {length + cosine, sine * axis};
-  if (cosine < 0.0) turn = {sine, (length - cosine) * axis};
-  if (length == 0.0) turn = {1.0, {}};
+  const T length = square_root(sine * sine + cosine * cosine);
+  Quaternion<T> turn = {length + cosine, sine * axis};
+  if (cosine < 0) turn = {sine, (length - cosine) * axis};
+  if (length == 0) turn = {1, {}};
   return normalised(q * turn);
 }
 
+// The attitude after the turn about a unit axis that brings a direction nearest to that of the reference frame.
+template <class T>
+inline Quaternion<T> turned_about(const Quaternion<T> &q, const Vector<T> &axis, const Vector<T> &body,
+                                  const Vector<T> &reference) {
+  const Vector<T> there = rotate_back(q, reference);
+  return turned_by(q, axis, dot(axis, cross(body, there)), dot(body, there) - dot(axis, body) * dot(axis, there));
+}
+
 // The filter of one satellite, with its gate and second hypothesis.
+template <class Real = double, class States = RuntimeStates>
 class GatedFilter {
-  Hypothesis main_, second_;
+  typedef FilterModel<Real, States> Model;
+  Hypothesis<Real, States> main_, second_;
   Contest contest_;
 
  public:
-  void start(const Estimate &first) {
+  void start(const Estimate<Real> &first) {
     main_.start(first);
     contest_ = Contest();
   }
-  Hypothesis &main() { return main_; }
+  Hypothesis<Real, States> &main() { return main_; }
+  const Hypothesis<Real, States> &main() const { return main_; }
 
-  void predict(const FilterModel &model, const Instant &now, const Instant &next, const double *kept,
-               const double *added_variance, double dt) {
+  void predict(const Model &model, const Instant<Real> &now, const Instant<Real> &next, const Real *kept,
+               const Real *added_variance, double dt) {
     main_.predict(model, now, next, kept, added_variance, dt);
     if (contest_.has_second()) second_.predict(model, now, next, kept, added_variance, dt);
   }
 
   // Take the readings of an instant; those of a sensor that is not in use are NaN. The results are of each sensor.
-  void update(const FilterModel &model, const Gate &gate, const Instant &now, const Readings &readings, int64_t instant,
-              double *nis, double *log_determinant, uint8_t *rejected) {
+  void update(const Model &model, const Gate &gate, const Instant<Real> &now, const Readings<Real> &readings,
+              int64_t instant, double *nis, double *log_determinant, uint8_t *rejected) {
     contest_.set_instant(instant);
     main_.begin_readings();
     if (contest_.has_second()) second_.begin_readings();
@@ -170,7 +179,7 @@ class GatedFilter {
       if (!use.main) main_.undo();
       if (has_second && !use.second) second_.undo();
       if (!use.main && contest_.may_begin(gate, model, sensor, both)) {
-        begin_second(model, gate, now, readings, sensor);
+        begin_second(model, now, readings, sensor);
         second_.update(model, now, readings, sensor);
         contest_.begin(sensor);
       }
@@ -189,29 +198,28 @@ class GatedFilter {
  private:
   // Make the second hypothesis one in which a reading is right, before that reading. Of a gyro its bias is open; else
   // the attitude is that of the readings, and all is open.
-  void begin_second(const FilterModel &model, const Gate &gate, const Instant &now, const Readings &readings,
-                    int sensor) {
+  void begin_second(const Model &model, const Instant<Real> &now, const Readings<Real> &readings, int sensor) {
     if (sensor == Sensor::gyro) {
       second_ = main_;
-      Covariance &P = second_.P();
+      Covariance<Real, States> &P = second_.P();
       for (int j = 0; j < 3; ++j) {
-        const int at = model.place[Optional::gyro_bias] + j;
-        for (int i = 0; i < model.n; ++i) P[at][i] = P[i][at] = 0.0;
-        P[at][at] = gate.open_variance[at];
+        const int at = model.place(Optional::gyro_bias) + j;
+        for (int i = 0; i < model.n(); ++i) P[at][i] = P[i][at] = 0;
+        P[at][at] = model.open_variance[at];
       }
     } else {
       second_.start(main_.x);
       second_.x.motion.q = read_attitude(main_.x.motion.q, now, readings, sensor);
-      for (int i = 0; i < model.n; ++i) second_.P()[i][i] = gate.open_variance[i];
+      for (int i = 0; i < model.n(); ++i) second_.P()[i][i] = model.open_variance[i];
     }
     second_.keep_attitude_variance();
   }
 
-  static Quaternion<double> read_attitude(const Quaternion<double> &q, const Instant &now, const Readings &readings,
-                                          int sensor) {
+  static Quaternion<Real> read_attitude(const Quaternion<Real> &q, const Instant<Real> &now,
+                                        const Readings<Real> &readings, int sensor) {
     if (sensor == Sensor::star_tracker) return normalised(readings.star);
     if (!is_finite(readings.sun[0])) return turned_onto(q, readings.field, now.around.field);
-    const Quaternion<double> by_sun = turned_onto(q, readings.sun, now.sun);
+    const Quaternion<Real> by_sun = turned_onto(q, readings.sun, now.sun);
     return is_finite(readings.field[0]) ? turned_about(by_sun, readings.sun, readings.field, now.around.field) : by_sun;
   }
 };

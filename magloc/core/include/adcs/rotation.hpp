@@ -66,11 +66,13 @@ MAGLOC_INLINE Vector<double> vector_at(const double *numbers) { return {{numbers
 MAGLOC_INLINE void store(const Vector<double> &v, double *numbers) { __builtin_memcpy(numbers, v.at, sizeof v.at); }
 
 // A constant matrix: row i is row[i].
-struct Matrix {
-  Vector<double> row[3];
+template <class Real>
+struct MatrixOf {
+  Vector<Real> row[3];
 
-  MAGLOC_INLINE double operator()(int i, int j) const { return row[i][j]; }
+  MAGLOC_INLINE Real operator()(int i, int j) const { return row[i][j]; }
 };
+typedef MatrixOf<double> Matrix;
 MAGLOC_INLINE Matrix matrix_at(const double *numbers) {
   return {{vector_at(numbers), vector_at(numbers + 3), vector_at(numbers + 6)}};
 }
@@ -78,8 +80,8 @@ MAGLOC_INLINE void store(const Matrix &m, double *numbers) {
   for (int i = 0; i < 3; ++i) store(m.row[i], numbers + 3 * i);
 }
 
-template <class T>
-MAGLOC_INLINE Vector<T> operator*(const Matrix &m, const Vector<T> &v) {
+template <class Real, class T>
+MAGLOC_INLINE Vector<T> operator*(const MatrixOf<Real> &m, const Vector<T> &v) {
   Vector<T> product;
   for (int i = 0; i < 3; ++i) product[i] = m(i, 0) * v[0] + m(i, 1) * v[1] + m(i, 2) * v[2];
   return product;

@@ -48,21 +48,23 @@
                                                      double *workspace)
 
 MAGLOC_BEGIN
-// The caller's workspace, handed out in pieces that start at multiples of 64 bytes. With a null pointer it only counts.
+// The caller's workspace, handed out in pieces that start at multiples of 64 bytes, without lanes at those of a double.
+// With a null pointer it only counts.
 class Workspace {
+  static constexpr int64_t unit = MAGLOC_LANES > 1 ? 64 : sizeof(double), numbers = unit / (int64_t)sizeof(double);
   double *start_;
   int64_t used_ = 0;
 
  public:
   explicit Workspace(double *memory) : start_(memory) {
-    if (memory) start_ += (64 - (uintptr_t)memory % 64) % 64 / sizeof(double);
+    if (memory) start_ += (unit - (uintptr_t)memory % unit) % unit / sizeof(double);
   }
   template <class T>
   T *take(int64_t count) {
     T *piece = start_ ? reinterpret_cast<T *>(start_ + used_) : nullptr;
-    used_ += (count * (int64_t)sizeof(T) + 63) / 64 * 8;
+    used_ += (count * (int64_t)sizeof(T) + unit - 1) / unit * numbers;
     return piece;
   }
-  int64_t size() const { return used_ + 8; }
+  int64_t size() const { return used_ + numbers; }
 };
 MAGLOC_END
