@@ -17,7 +17,7 @@ def check_random_updates(source: Path, count: int, folder: Path) -> None:
         pytest.skip("no C++ compiler")
     program = folder / "random_updates"
     includes = [f"-I{core.include_dir()}", f"-I{Path(__file__).parent}"]
-    command = [COMPILER, "-std=c++17", "-O1", *includes, "-Wall", "-Wextra", "-Werror", str(source), "-o", str(program)]
+    command = [COMPILER, "-std=c++17", "-O0", *includes, "-Wall", "-Wextra", "-Werror", str(source), "-o", str(program)]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     if subprocess.run([*command, *sanitizers], check=False, capture_output=True).returncode:
         subprocess.run(command, check=True)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import ast
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Set
+from itertools import groupby
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
@@ -25,8 +26,8 @@ _MOST_NAMES = 3  # functions and kernels that a line of the page names
 _HEAD = """# Walks: the path of one row
 
 The files that one row passes, in the order in which a debugger enters them, with the first functions that run there.
-Imports, caches and the guard of linear algebra's threads are not part of a walk.
-`python -m tests.walks` writes this page.
+Imports, caches and the guard of linear algebra's threads are not part of a walk. Files without a sentence are
+explained in an earlier walk. `python -m tests.walks` writes this page.
 """
 
 
@@ -91,12 +92,22 @@ def walk(call: Callable[[], object]) -> Walk:
 
 def page() -> str:
     """Return the text of the page."""
-    return _HEAD + "".join(f"\n## {title}\n\n{_lines(walk(make()))}" for title, make in WALKS.items())
+    text, known = _HEAD, set[str]()
+    for title, make in WALKS.items():
+        path = walk(make())
+        text += f"\n## {title}\n\n{_lines(path, known)}"
+        known |= path.functions.keys()
+    return text
 
 
-def _lines(path: Walk) -> str:
-    head = f"{len(path.functions)} files, {path.switches} switches between files.\n\n"
-    return head + "".join(f"{i}. {_line(*item)}\n" for i, item in enumerate(path.functions.items(), 1))
+def _lines(path: Walk, known: Set[str]) -> str:
+    """Return a numbered line of each file, and one line of successive files that an earlier walk explains."""
+    lines = [f"{len(path.functions)} files, {path.switches} switches between files.\n\n"]
+    for is_known, group in groupby(path.functions.items(), lambda item: item[0] in known):
+        items = list(group)
+        described = [", ".join(f"`{file}`" for file, _ in items)] if is_known else [_line(*item) for item in items]
+        lines += [f"{i}. {line}\n" for i, line in enumerate(described, len(lines))]
+    return "".join(lines)
 
 
 def _line(file: str, names: list[str]) -> str:

@@ -63,7 +63,7 @@ def fit_source_on_path(problem: CalibrationProblem, start: CalibrationState) -> 
 
 
 def nominal_state(problem: CalibrationProblem, position_m: FloatArray, moment_Am2: FloatArray) -> CalibrationState:
-    """Return a state of the nominal array, with sources (n, 3) and moments in the world."""
+    """Return the state of the nominal array with sources (n, 3) and moments in the world frame."""
     return CalibrationState(np.zeros(problem.prior.shape), position_m, 0.0, moment_Am2, np.zeros_like(position_m))
 
 

@@ -36,7 +36,7 @@ class ReducedEquations:
     Attributes
     ----------
     information : ndarray, shape (P, P)
-        Information of the readings alone; P counts the F free unknowns of the sensors, then those of the source.
+        Information of the readings alone. The P unknowns are the F free ones of the sensors, then those of the source.
     gradient : ndarray, shape (P,)
         Gradient of half of χ².
     by_row, row_gradient, row_factor : ndarray, shapes (T, n, P), (T, n), (T, n, n)

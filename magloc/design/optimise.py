@@ -162,8 +162,8 @@ def design_array(
     places = [start for start in places if is_spaced(task, start) and np.isfinite(small.value(task, start))]
     if not places:
         raise ValueError(
-            "Input task must leave room for its sensors, least_spacing_m apart, where they determine the range of its"
-            " sources; instead no start does."
+            "Input task must allow sensors, least_spacing_m apart, that determine the range of its sources; instead no"
+            " start has such sensors."
         )
     values = [large.value(task, start) for start in places]
     first = int(np.argmin(values))

@@ -19,7 +19,7 @@ from arrays.typing import FloatArray
 from magloc.logs.units import NO_UNIT, LoggedUnit
 
 ROWS = "rows"
-"""Clock of a channel without times: they count its rows."""
+"""Clock of a channel without times: the numbers of its rows."""
 
 
 @dataclass(frozen=True, eq=False)

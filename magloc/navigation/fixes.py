@@ -24,7 +24,7 @@ _AS_FAST = 0.5  # Above this share of the usual speed over a run, the place was 
 
 
 class Interpolated(NamedTuple):
-    """Poses between fixes, standard deviation of places along each axis, and number of rows with held places.
+    """Poses between fixes, standard deviation of positions along each axis, and number of rows with repeated positions.
 
     Rows from ``end`` are after the last fix; their places are unknown.
     """

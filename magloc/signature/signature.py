@@ -55,7 +55,7 @@ class Components:
     induced : {"none", "diagonal", "symmetric"}
     eddy : bool
     ambient_T, rate_T_s : float
-        Modulus of the ambient field and its largest rate in the body, at which parameters have the unit A·m².
+        Modulus of the ambient field and its largest rate in the body. They scale the parameters to A·m².
     """
 
     induced: Induced

@@ -57,7 +57,7 @@ class SearchGrid:
 
     @property
     def levels(self) -> dict[float, SearchGrid]:
-        """Grids of each distance alone."""
+        """Grids, one for each distance."""
         distances = dict.fromkeys(distance for distance, _ in self.tiles)
         return {at: SearchGrid([tile for tile in self.tiles if tile[0] == at]) for at in distances}
 

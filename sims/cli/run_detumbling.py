@@ -35,8 +35,8 @@ def detumbling(
     Parameters
     ----------
     damping : str
-        Torquers with the "readings" of the magnetometer, or with the "estimate" of a filter of magnetometer, Sun sensor
-        and gyro, which knows the commands; or hysteresis "rods" along x and y, 1 cm³ each.
+        Torquers controlled by the "readings" of the magnetometer, or by the "estimate" of a filter of magnetometer, Sun
+        sensor and gyro; or hysteresis "rods" along x and y, 1 cm³ each.
     rate_deg_s : float
         Rate at the start, about a random axis [°/s].
     moment_Am2 : float

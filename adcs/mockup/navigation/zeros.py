@@ -216,12 +216,13 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
     """Fit two zeros in closed form, with the start of a straight line through the first fixes.
 
     The line fits the fixes minus the motion by the samples, which depends on the zeros.
-    ``problem``: problem without further courses. ``first``: number of fixes on the line; two as in the source, where
+    ``problem``: problem with constant zeros only. ``first``: number of fixes on the line; two as in the source, where
     the velocity has √2 times the noise of a fix over one period. ``sigma_m``: noise of a fix, each axis, for the
     covariance.
     """
     if len(problem.by_zero) != 1:
-        raise ValueError(f"Input problem must be without further courses; instead received {len(problem.by_zero) - 1}.")
+        further = len(problem.by_zero) - 1
+        raise ValueError(f"Input problem must have constant zeros only; instead received {further} more for each axis.")
     turn, t = problem.by_zero[0], problem.time_s
     if not 2 <= first < t.size:
         raise ValueError(f"Input first must be 2 or more and less than the {t.size} fixes; instead received {first}.")

@@ -121,7 +121,7 @@ class PlacedRow:
 
 
 def placed_rows(points: Sequence[TrackPoint]) -> list[PlacedRow]:
-    """Return the rows of the last track whose source is a Cartesian Gaussian."""
+    """Return the rows of the last track in which the source is a single Gaussian in Cartesian coordinates."""
     known = [i for i, point in enumerate(points) if point.is_on_track]
     begin = max((i for i in known if points[i].status == "acquired" or i == known[0]), default=0)
     found = (_placed_row(i, points[i]) for i in known if i >= begin)

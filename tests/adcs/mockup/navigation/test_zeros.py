@@ -271,7 +271,7 @@ class TestRefusals:
 
     def test_courses_where_there_are_none(self) -> None:
         problem = self.problem(courses=np.linspace(0.0, 1.0, 1500)[None])
-        with pytest.raises(ValueError, match="must be without further courses; instead received 1"):
+        with pytest.raises(ValueError, match="must have constant zeros only; instead received 1 more"):
             constant_zeros_after(problem)
 
     def test_shapes_and_missing_readings(self) -> None:
