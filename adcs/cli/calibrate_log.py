@@ -66,6 +66,9 @@ def calibrate_log(
     with naming(str(log)):
         found = adcs.calibrate_log(file.log, field_T=field_T)
     seconds = time.perf_counter() - began
+    if not found.fit.converged:
+        expected = "readings of one motion in the field of one place: check place, units, axes and clocks"
+        raise InputError(f"{log}: found a fit that does not converge, expected {expected}. No file is written.")
     write(found, out)
     note(f"wrote {out}")
     axes = "" if out.suffix.lower() == ".toml" else axes_warning(found)

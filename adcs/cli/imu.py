@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import adcs
 from adcs.cli.options import ReportOptions
 from adcs.complementary.names import Magnet
-from arrays.io.errors import naming
+from arrays.io.errors import InputError, naming
 from magloc.cli.framework import Flag, warn
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ def imu(
     /,
     *,
     config: Path | None = None,
+    calibration: Path | None = None,
     method: Literal["auto", "plain", "reject", "subtract"] = "auto",
     offline: Flag = False,
     report: ReportOptions = ReportOptions(),  # noqa: B008 - frozen
@@ -47,6 +48,9 @@ def imu(
         attitude is compared with its own.
     config : Path, optional
         TOML file whose table log states other names of columns, units and mountings.
+    calibration : Path, optional
+        Array file of the magnetometer, such as from ``adcs calibrate-log --out mag.toml``: the field is corrected by
+        its scale and offset, in body axes.
     method : str
         Treatment of a field that contradicts the filter: rejected until the motion shows that it moves with the sensor,
         then subtracted ("auto"); rejected ("reject"); subtracted, as the field of a magnet that moves with
@@ -60,6 +64,8 @@ def imu(
 
     report.check()
     data = adcs.read_imu(log, config)
+    if calibration is not None:
+        data = _calibrated(data, calibration)
     began = time.perf_counter()
     track = inertial_attitude(log, data, MAGNETS[method], offline=offline)
     summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
@@ -76,6 +82,19 @@ def imu(
             picture = inertial_figure(track, log.stem, data.q_true)
         report.write([("attitude.csv", attitude_columns(track)), ("attitude.png", picture)])
     report.print(summary, summary_words(summary))
+
+
+def _calibrated(data: ImuLog, path: Path) -> ImuLog:
+    """Return a log with its field corrected by the array file of its magnetometer."""
+    from dataclasses import replace
+
+    from arrays.array_file import read_array
+
+    array = read_array(path)
+    if len(array.sensors) != 1 or array.sensors[0].kind != "vector":
+        raise InputError(f"{path}: found {array.n_sensors} sensors, expected one vector sensor (--calibration).")
+    field_T = array.calibrated_field(data.record.field_T)[:, 0]
+    return replace(data, record=replace(data.record, field_T=field_T))
 
 
 def inertial_attitude(log: Path, data: ImuLog, magnet: Magnet = "auto", *, offline: bool = False) -> adcs.AttitudeTrack:

@@ -15,6 +15,7 @@ from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.attitude_filter import AttitudeConfig, filter_rows
 from adcs.complementary.explicit import BEST_GAINS, Gains, complementary_track
 from adcs.complementary.heading import HeadingModel, heading_track, relative_heading, rotate_to_north
+from adcs.complementary.inertial.gaps import UNKNOWN_RAD
 from adcs.complementary.inertial_magnetic import (
     InertialMagneticRecord,
     RecordMotion,
@@ -251,7 +252,9 @@ def _filtered(record: InertialMagneticRecord, magnet: Magnet, model: HeadingMode
     if rows.status.any():
         raise ValueError(f"Input time_s must be within 1e14 s; instead received {np.abs(record.time_s).max():g} s.")
     left_out, subtracted, doubted = map(rows.has_flag, ("field-left-out", "magnet-subtracted", "heading-doubtful"))
-    tilt, heading = rows.sigma.T
+    tilt, heading = rows.sigma.T.copy()
+    if record.has_field:  # until the first field the filter's heading is relative to the first row
+        heading[: np.argmax(is_read(record.field_T))] = UNKNOWN_RAD
     return _Attitudes(
         rows.q,
         rows.corrected_rate,

@@ -33,6 +33,8 @@ _PLACES = (
 _LEAST_ROWS, _LEAST_RATE_Hz = 20, 5.0
 _LEAST_RANGE = {"A": 0.5, "": 0.02}
 _TEXT_CURRENTS = ("_A", "throttle")
+_COMPASS = ("OFS", "DIA", "ODI")  # parameters of ArduPilot
+_ROUNDED_mG = 1.0  # largest difference of a logged offset and its parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +174,10 @@ def _binary_log(log: Log, currents: Sequence[str]) -> VehicleFile:
         kept = [one for one, unit in zip(series, units, strict=True) if _varies(one, _LEAST_RANGE.get(unit, 0.02))]
         series = kept[:1]
     corrected = best[0].name.startswith(("vehicle_magnetometer", "sensor_combined", "MAG"))
-    if corrected and len(best) == 1 and (raw := _uncorrected(best[0], log)) is not None:
-        best, corrected = [raw], False
+    raw = [_uncorrected(one, log, alone=len(best) == 1) for one in best] if corrected else []
+    if known := [one for one in raw if one is not None]:
+        # A calibration replaces the autopilot's parameters for all magnetometers, or adds to them.
+        best, corrected = (known, False) if len(known) == len(best) else (best, True)
     with naming(log.path):
         vehicle = VehicleLog(
             gyro.time_s, gyro.values, resample(gyro.time_s, force.time_s, force.values), tuple(best), tuple(series)
@@ -193,7 +197,44 @@ _CORRECTED = (
 )
 
 
-def _uncorrected(series: Series, log: Log) -> Series | None:
+def _uncorrected(series: Series, log: Log, *, alone: bool) -> Series | None:
+    """Return fields without the autopilot's own calibration; None where it is unknown or turns the axes.
+
+    PX4 does not state which of several magnetometers its parameters belong to.
+    """
+    if _message(series) == "MAG":
+        return _ardupilot_raw(series, log)
+    return _px4_raw(series, log) if alone else None
+
+
+def _ardupilot_raw(series: Series, log: Log) -> Series | None:
+    """Return fields without ArduPilot's parameters; None where the log does not state them.
+
+    A logged field is S (raw + offset) scale + motor, with S of DIA and ODI (magfit_WMM.py of pymavlink). Offsets and
+    motor fields are logged beside it; the offsets show which parameters belong to a magnetometer.
+    """
+    names = [f"{series.name}.{kind}{axis}" for kind in ("Ofs", "MO") for axis in "XYZ"]
+    if not set(names) <= set(log):
+        return None
+    time_s, logged_T = log.vectors(names)
+    at = np.searchsorted(time_s, series.time_s).clip(max=len(time_s) - 1)
+    if not np.array_equal(time_s[at], series.time_s):
+        return None
+    offset_T, motor_T = logged_T[at, :3], logged_T[at, 3:]
+    for slot in ("", "2", "3"):
+        kinds = {kind: [log.parameters.get(f"COMPASS_{kind}{slot}_{axis}") for axis in "XYZ"] for kind in _COMPASS}
+        stated = {kind: np.array(three, np.float64) for kind, three in kinds.items() if None not in three}
+        if len(stated) < len(_COMPASS) or np.abs(1e7 * offset_T[-1] - stated["OFS"]).max() > _ROUNDED_mG:
+            continue
+        (xx, yy, zz), (xy, xz, yz) = stated["DIA"], stated["ODI"]
+        S = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) if stated["DIA"].any() else np.eye(3)
+        S = S * (log.parameters.get(f"COMPASS_SCALE{slot}") or 1.0)
+        device = int(log.parameters.get(f"COMPASS_DEV_ID{slot}", 0.0))
+        return replace(series, values=(series.values - motor_T) @ np.linalg.inv(S).T - offset_T, device_id=device)
+    return None
+
+
+def _px4_raw(series: Series, log: Log) -> Series | None:
     """Return fields without the calibration of PX4's parameters; None where they are unknown or turn the axes."""
     values = log.parameters
     slots = [k for k in range(4) if values.get(f"CAL_MAG{k}_ID")]

@@ -28,6 +28,8 @@ _LARGEST_FIELD_T = 70e-6
 _TURNED_DEG = 20.0
 _LARGE_SOFT_IRON = 0.3
 _LARGE_NOISE = 0.1  # of the field
+_SLOW_CURRENT_Hz = 10.0
+_LARGE_LAG_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,8 +210,9 @@ def calibrate_log(
     if field_T is not None and np.shape(field_T) != (3,):
         raise ValueError(f"Input field_T must have shape (3,); instead received {np.shape(field_T)}.")
     field = FieldPrior() if field_T is None else FieldPrior.of(np.asarray(field_T, np.float64), field_error_T)
+    usable = [_usable(one, log) for one in log.magnetometers]
     try:
-        fit = fit_log(log, field)
+        fit = fit_log(replace(log, magnetometers=tuple(series for series, _ in usable)), field)
     except np.linalg.LinAlgError:
         raise ValueError(
             "Input log must have readings that fit one motion; instead received others. Check units."
@@ -225,27 +228,51 @@ def calibrate_log(
         field,
         ranges,
     )
-    return LogCalibration(log, fit, terms, tuple(advice(fit, terms)), tuple(_flags(fit, terms)))
+    names = [one.name for m, one in enumerate(problem.magnetometers) if _contradicts(fit, m)]
+    terms = terms.without(names) if fit.converged else terms.without()
+    doubts = [sentence for _, sentences in usable for sentence in sentences]
+    return LogCalibration(log, fit, terms, tuple(advice(fit, terms)), (*doubts, *_flags(fit, terms)))
+
+
+def _usable(series: Series, log: VehicleLog) -> tuple[Series, list[str]]:
+    """Return a magnetometer's readings without those that are stuck, and sentences on what is missing."""
+    known = series.finite()
+    stuck = known.stuck_parts()
+    rest = known.outside(stuck)
+    if not len(rest.values):
+        return known, []
+    words = "{} stands at one value from {:.1f} to {:.1f} s; these readings are left out"
+    sentences = [words.format(series.name, *part) for part in stuck]
+    silent = known.silent_parts(float(log.time_s[0]), float(log.time_s[-1]))
+    return rest, sentences + [f"{series.name} has no readings from {a:.1f} to {b:.1f} s" for a, b in silent]
+
+
+def _contradicts(fit: LogFit, m: int) -> bool:
+    """Return True for a magnetometer whose noise is far too large: it measures another motion or another field."""
+    estimate = fit.estimate
+    return bool(estimate.problem.noise.white_uT[m] > _LARGE_NOISE * np.linalg.norm(estimate.field_uT[0]))
 
 
 def _flags(fit: LogFit, terms: Terms) -> Iterator[str]:
     """Yield sentences on doubts."""
     estimate, data = fit.estimate, fit.estimate.problem.inertial
     if not fit.converged:
-        yield "the fit did not converge: the terms are not valid"
+        yield "the fit did not converge: check place, units and axes; no term is determined"
     if not estimate.problem.field.is_known:
         yield f"the modulus of the field is not known, so neither is the scale: {PLACE}"
     for m, series in enumerate(estimate.problem.magnetometers):
         name = series.name
         matrix = estimate.parameters[estimate.problem.layout.matrix(m)].reshape(3, 3)
         _, symmetric, turn = soft_iron(matrix, fit.mountings[m])
-        noise_uT = float(estimate.problem.noise.white_uT[m])
-        if noise_uT > _LARGE_NOISE * np.linalg.norm(estimate.field_uT[0]):
+        if _contradicts(fit, m):
             yield (
-                f"{name} contradicts gyro and accelerometer by {1e3 * noise_uT:.0f} nT, expected less than a tenth of"
-                " the field: check signs, axes, units and clocks"
+                f"{name} contradicts gyro and accelerometer by {1e3 * estimate.problem.noise.white_uT[m]:.0f} nT,"
+                " expected less than a tenth of the field: check signs, axes, units and clocks of all sensors"
             )
             continue
+        lag_s = float(estimate.parameters[estimate.problem.layout.lag(m)])
+        if abs(lag_s) > _LARGE_LAG_S:
+            yield f"{name} lags by {1e3 * lag_s:.0f} ms, which no parameter of an autopilot corrects: check its clock"
         number, word = nearest_rotation(fit.mountings[m].T)
         if number:
             yield (
@@ -264,7 +291,16 @@ def _flags(fit: LogFit, terms: Terms) -> Iterator[str]:
         if len(parts) > 3:
             yield f"{name} is disturbed in {len(parts) - 3} further parts of the log, which are left out"
     if data.in_gap.any():
-        yield f"gyro or accelerometer have gaps in {int(data.in_gap.sum())} intervals of {data.span_s[0]:.1f} s"
+        yield f"gyro or accelerometer have gaps within {data.span_s[data.in_gap].sum():.0f} s of the log"
+    if not estimate.problem.currents:
+        yield (
+            "the log has no current or throttle: fields of motors, if there are any, are in the offsets, and no σ"
+            " counts them"
+        )
+    for series in estimate.problem.currents:
+        if (rate := (len(series.time_s) - 1) / max(float(np.ptp(series.time_s)), 1e-9)) < _SLOW_CURRENT_Hz:
+            few = f"{series.name} has {rate:.1f} readings a second, expected {_SLOW_CURRENT_Hz:g}"
+            yield f"{few}: its field is less certain than σ"
 
 
 def _parts(mask: Any) -> list[tuple[int, int]]:

@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import polar
+from scipy.spatial.transform import Rotation
 
 from adcs.log_calibration.arrow import ArrowSystem, Solution
 from adcs.log_calibration.linear import LinearModel
-from adcs.log_calibration.parameters import AXES, GYRO_BIAS, INCLINATION, MODULUS, FieldPrior, Layout
+from adcs.log_calibration.parameters import GYRO_BIAS, INCLINATION, MODULUS, FieldPrior, Layout
 from adcs.log_calibration.record import FEWEST_ROWS, InertialData, VehicleLog
+from adcs.log_calibration.rotations import nearest_rotation, rotation_matrices
 from adcs.log_calibration.start import find_start
 from adcs.log_calibration.system import Estimate, Noise, Problem, slow_field
 from arrays.typing import BoolArray, FloatArray
@@ -24,13 +27,14 @@ _TURN_RAD_RTS = (1e-5, 1e-2)
 _SIGMA = ((1e-5, 1e-2), (0.05, 100.0), (3e-3, 10.0))  # of gyro drift [rad/s], velocity [m/s], slow fields [µT]
 _TIME_S = ((100.0, 100.0), (1.0, 100.0), (2.0, 200.0))
 _ITERATIONS = 4
-_LAST_ITERATIONS = 10
+_LAST_ITERATIONS = 40
 _BLOCK_S = 0.5
 _OUTLIER = 30.0  # χ² of three components of a reading
 _MEDIAN_OF_THREE = 0.789  # median of χ² / dof with three degrees of freedom
 _DISTURBED = 4.0  # typical χ² per dimension of an interval
 _FAR = 5.0  # slow error over its usual size
 _LEAST_uT = 1e-3
+_FAR_MOUNTING_RAD = math.radians(30.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,21 +123,29 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
         used = tuple(_used_rows(estimate, m, noise, disturbed[m]) for m in range(M))
         problem = replace(estimate.problem, noise=noise, used=used)
         estimate = Estimate.at(problem, estimate.parameters, estimate.knots_q, estimate.states)
+    mountings = np.array([_mounting(estimate, m, start.mountings[m]) for m in range(M)])
+    prior = prior.copy()
+    for m, mounting in enumerate(mountings):
+        prior[layout.matrix(m)] = mounting.ravel()
+    problem = replace(estimate.problem, prior=prior)
+    estimate = Estimate.at(problem, estimate.parameters, estimate.knots_q, estimate.states)
     last = minimise(_Iterate(estimate), lambda _: 1e-2, damping=1e-9, max_iterations=_LAST_ITERATIONS)
     estimate = last.point.estimate
-    for m, mounting in enumerate(start.mountings):
-        _check_handed(layout.magnetometers[m], estimate.parameters[layout.matrix(m)].reshape(3, 3) @ mounting.T)
-    return LogFit(estimate, _Iterate(estimate).system.solve(), start.mountings, disturbed, last.converged)
+    return LogFit(estimate, _Iterate(estimate).system.solve(), mountings, disturbed, last.converged)
 
 
-def _check_handed(name: str, matrix: FloatArray) -> None:
-    """Refuse a magnetometer whose matrix (3, 3), by its mounting, reverses an axis."""
+def _mounting(at: Estimate, m: int, start: FloatArray) -> FloatArray:
+    """Return the usual mounting that is nearest to a magnetometer's matrix, if that of the start is far from it."""
+    matrix = at.parameters[at.problem.layout.matrix(m)].reshape(3, 3)
     if np.linalg.det(matrix) <= 0.0:
-        axis = AXES[int(np.argmin(np.diagonal(matrix)))]
         raise ValueError(
-            f"Input {name} must have right-handed axes; instead received readings that fit with {axis} reversed."
-            " Change the sign of that axis."
+            f"Input {at.problem.magnetometers[m].name} must have right-handed axes; instead received readings that fit"
+            " with an axis reversed. Check the signs of x, y and z."
         )
+    turn, _ = polar(matrix, side="left")
+    if Rotation.from_matrix(turn @ start.T).magnitude() < _FAR_MOUNTING_RAD:
+        return start
+    return np.asarray(rotation_matrices()[nearest_rotation(turn.T)[0]].T)
 
 
 def most_likely_noise(model: LinearModel, noise: Noise, usual: Noise) -> Noise:

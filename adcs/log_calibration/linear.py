@@ -8,7 +8,7 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.log_calibration.arrow import ArrowSystem
-from adcs.log_calibration.parameters import FORCE, GRAVITY, GYRO_BIAS, GYRO_MATRIX, INCLINATION, MODULUS
+from adcs.log_calibration.parameters import FORCE, GRAVITY, GYRO_BIAS, GYRO_MATRIX, INCLINATION, MODULUS, THRUST
 from adcs.log_calibration.system import HEADING_RAD, Estimate, Noise, slow_field
 from arrays.typing import FloatArray
 from magloc.navigation.rotations import cross_matrix
@@ -167,7 +167,12 @@ def _add_priors(system: ArrowSystem, at: Estimate, noise: Noise) -> None:
     J = np.zeros((K - 1, n - 3, 2 * n))
     rows = np.arange(n - 3)
     J[:, rows, 3 + rows], J[:, rows, n + 3 + rows] = -factor * weight, weight
-    system.add_pairs(J, np.zeros((K - 1, n - 3, p)), -(slow[1:] - factor * slow[:-1]) * weight)
+    speed = (at.thrust_speed(noise)[:, None] * weight[:, 3:5])[:, :, None]
+    by_turn = 0.5 * at.parameters[THRUST] * speed * cross_matrix(at.thrust)[:, :2]
+    J[:, 3:5, :3], J[:, 3:5, n : n + 3] = by_turn, by_turn
+    JP = np.zeros((K - 1, n - 3, p))
+    JP[:, 3:5, THRUST] = -speed[:, :, 0] * at.thrust[:, :2]
+    system.add_pairs(J, JP, -at.slow_steps(noise) * weight)
     first = np.repeat(noise.sigma, 3) ** -2.0
     system.diagonal[0][3 + rows, 3 + rows] += first
     system.gradient[0][3:] -= first * slow[0]

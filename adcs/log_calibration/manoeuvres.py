@@ -29,6 +29,7 @@ PLACE = "state place and date (--place, --date)"
 _LAG = "turn quickly to and fro about the yaw axis"
 _REST = "rest for ten seconds"
 _SIDES = "rest on several sides"
+_FAULT = "correct the faults that the warnings name"
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +84,7 @@ def advice(fit: LogFit, terms: Terms) -> list[str]:
     if not fit.estimate.problem.field.is_known:
         fixed["scale"] = PLACE
     for i in np.flatnonzero(~determined):
-        words[i] = fixed.get(terms.kinds[i], "")
+        words[i] = fixed.get(terms.kinds[i], "") if terms.largest[i] > 0.0 else _FAULT
     if all(words[i] for i in np.flatnonzero(~determined)):
         return words
     last = ""

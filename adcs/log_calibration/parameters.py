@@ -14,11 +14,11 @@ PRIOR_MODULUS = 0.3
 PRIOR_MATRIX, PRIOR_OFFSET_uT, PRIOR_LAG_S, PRIOR_CURRENT = 0.1, 100.0, 0.1, 0.2
 """Prior σ of an element of the soft iron, the hard iron [µT], the lag and the effect of a current's range [field]."""
 PRIOR_GYRO_BIAS_RAD_S, PRIOR_GYRO_MATRIX, PRIOR_FORCE_M_S2 = math.radians(2.0), 0.01, 0.3
-_PRIOR_GRAVITY_M_S2 = 0.02
+_PRIOR_GRAVITY_M_S2, _PRIOR_THRUST = 0.02, 1.0
 SYMMETRIC = np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
 """Elements of the gyro's symmetric matrix of scales and axes."""
-N_SHARED = 15
-MODULUS, INCLINATION, GRAVITY = 0, 1, 2
+N_SHARED = 16
+MODULUS, INCLINATION, GRAVITY, THRUST = 0, 1, 2, 15
 GYRO_BIAS, GYRO_MATRIX, FORCE = slice(3, 6), slice(6, 12), slice(12, 15)
 
 
@@ -97,7 +97,7 @@ class Layout:
         """Return the prior standard deviations of all parameters."""
         sigma = np.empty(self.size)
         sigma[MODULUS], sigma[INCLINATION] = field.modulus_sigma, field.inclination_sigma_rad
-        sigma[GRAVITY], sigma[FORCE] = _PRIOR_GRAVITY_M_S2, PRIOR_FORCE_M_S2
+        sigma[GRAVITY], sigma[FORCE], sigma[THRUST] = _PRIOR_GRAVITY_M_S2, PRIOR_FORCE_M_S2, _PRIOR_THRUST
         sigma[GYRO_BIAS], sigma[GYRO_MATRIX] = PRIOR_GYRO_BIAS_RAD_S, PRIOR_GYRO_MATRIX
         for m in range(len(self.magnetometers)):
             sigma[self.matrix(m)], sigma[self.offset(m)] = PRIOR_MATRIX, PRIOR_OFFSET_uT

@@ -14,6 +14,8 @@ from magloc.navigation.poses import vectors_at
 SHORTEST_S, FEWEST_ROWS = 2.0, 10
 _KNOT_S, _MOST_KNOTS = 2.0, 1500
 _LONGEST_GAP_S = 0.25
+_STUCK_S, _STUCK_ROWS = 5.0, 20
+_SILENT_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,26 @@ class Series:
     def span(self) -> float:
         """Difference of the largest and the smallest value, at least 1e-6."""
         return max(float(np.ptp(self.values)), 1e-6)
+
+    def stuck_parts(self) -> list[tuple[float, float]]:
+        """Return the times in which all readings are equal for longer than a sensor's noise allows."""
+        new = np.concatenate([[True], (np.diff(self.values, axis=0) != 0.0).any(axis=1)])
+        begin = np.flatnonzero(new)
+        end = np.append(begin[1:], len(new)) - 1
+        long = (end - begin >= _STUCK_ROWS) & (self.time_s[end] - self.time_s[begin] > _STUCK_S)
+        return [(float(self.time_s[a]), float(self.time_s[b])) for a, b in zip(begin[long], end[long], strict=True)]
+
+    def silent_parts(self, first_s: float, last_s: float) -> list[tuple[float, float]]:
+        """Return the times between two instants in which there are no readings for long."""
+        times = np.concatenate([[first_s], self.time_s, [last_s]])
+        return [(float(times[k]), float(times[k + 1])) for k in np.flatnonzero(np.diff(times) > _SILENT_S)]
+
+    def outside(self, parts: list[tuple[float, float]]) -> Series:
+        """Return the series without some parts."""
+        kept = np.ones(len(self.time_s), np.bool_)
+        for begin, end in parts:
+            kept &= (self.time_s < begin) | (self.time_s > end)
+        return Series(self.name, self.time_s[kept], self.values[kept], self.device_id)
 
     def finite(self) -> Series:
         """Return the series without missing samples and without samples that are not later than the one before."""
@@ -114,7 +136,9 @@ class VehicleLog:
 def _check_size(name: str, values: FloatArray, least: float, most: float, unit: str) -> None:
     """Refuse vectors (n, 3) whose typical length no sensor has."""
     known = values[np.isfinite(values).all(axis=1)]
-    size = float(np.median(np.linalg.norm(known, axis=1))) if len(known) else least
+    lengths = np.linalg.norm(known, axis=1)
+    lengths = lengths[lengths > 0.0] if lengths.any() else lengths  # a sensor that stops may go on with zeros
+    size = float(np.median(lengths)) if len(lengths) else least
     if not least <= size <= most:
         raise ValueError(
             f"Input {name} must have a median length of {least:g} to {most:g} {unit}; instead received {size:.3g}"

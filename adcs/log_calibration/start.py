@@ -18,6 +18,7 @@ _LEVEL_S = 10.0
 _QUIET_S, _QUIET_RAD_S = 3.0, math.radians(0.4)
 _WINDOW_S, _ROW_S = 300.0, 0.5
 _LARGEST_BIAS_RAD_S, _PHASE_RAD = math.radians(2.0), 0.3
+_LONG = 0.8  # of the longest readings
 _BETTER = 0.5  # ratio of residuals at which a turned mounting is taken
 _LEAST_MISFIT = 0.05  # of the field, below which the stated mounting is kept
 
@@ -66,7 +67,10 @@ def find_start(data: InertialData, magnetometers: tuple[Series, ...]) -> Start:
     q = _level(data, bias)
     samples = [_sampled(data, series) for series in magnetometers]
     found = [_fit_mounting(data.time_s, q, *each) for each in samples]
-    best = min(found, key=lambda fit: fit.misfit)
+    # Few attitudes fit any heading: a magnetometer that stops early does not set it.
+    spans = [float(np.ptp(data.time_s[at])) for at, _ in samples]
+    whole = [fit for fit, span in zip(found, spans, strict=True) if span >= _LONG * max(spans)]
+    best = min(whole, key=lambda fit: fit.misfit)
     turned = _rotate_heading(data.time_s, q, best.heading_rate)
     solved = [_solve(turned, *each, fit.mounting) for each, fit in zip(samples, found, strict=True)]
     field = solved[found.index(best)][:3]

@@ -8,6 +8,10 @@ the slow field error of each magnetometer. Between knots θ and the slow errors 
     y(t + τ) &= A R^T b + o + Σ_k c_k I_k(t) + d(t) + ν \\
     \bar{R (f - a)} &= (v_{k+1} - v_k) / Δt + g
 
+The velocity is a Markov process that the tilt may drive, as that of a multirotor: with the horizontal part u of the
+direction of the mean specific force, dv/dt = κ g u - v/τ + ν. The factor κ is a parameter. Without it, accelerations
+that follow the tilt would seem to say that there is no tilt.
+
 The field b has no component along x, which defines the heading.
 """
 
@@ -29,6 +33,7 @@ from adcs.log_calibration.parameters import (
     INCLINATION,
     MODULUS,
     SYMMETRIC,
+    THRUST,
     FieldPrior,
     Layout,
     field_enu_uT,
@@ -288,17 +293,33 @@ class Estimate:
         predicted[:, 2] += STANDARD_GRAVITY_M_S2 + self.parameters[GRAVITY]
         return self.mean_force[0] - predicted, np.where(data.in_gap, 0.0, 1.0 / _FORCE_NOISE_M_S2)
 
+    @cached_property
+    def thrust(self) -> FloatArray:
+        """Direction (K - 1, 3) of the thrust, which is that of the mean specific force in body axes, world frame."""
+        mean = np.nanmean(self.problem.inertial.acceleration_m_s2, axis=0)
+        return np.asarray(self.mean_force[2] @ (mean / np.linalg.norm(mean)))
+
+    def thrust_speed(self, noise: Noise) -> FloatArray:
+        """Return the speed (K - 1,) that a unit of :attr:`thrust` gives within an interval, where κ is 1 [m/s]."""
+        time_s = noise.time_s[1]
+        return np.asarray(STANDARD_GRAVITY_M_S2 * time_s * -np.expm1(-self.problem.inertial.span_s / time_s))
+
+    def slow_steps(self, noise: Noise) -> FloatArray:
+        """Return the unexplained steps (K - 1, n - 3) of the slow states."""
+        slow = self.states[:, 3:]
+        steps = slow[1:] - noise.slow_transitions(self.problem.inertial)[0] * slow[:-1]
+        steps[:, 3:5] -= self.parameters[THRUST] * self.thrust_speed(noise)[:, None] * self.thrust[:, :2]
+        return np.asarray(steps)
+
     def whitened_residuals(self, noise: Noise) -> list[FloatArray]:
         """Return all residuals over their standard deviations."""
         force, weight = self.force_residuals()
-        factor, step_weight = noise.slow_transitions(self.problem.inertial)
-        slow = self.states[:, 3:]
         return [
             *(rows.residual / white for rows, white in zip(self.rows, noise.white_uT, strict=True)),
             self.excess * noise.turn_weights(self.problem.inertial)[:, None],
             force * weight[:, None],
-            (slow[1:] - factor * slow[:-1]) * step_weight,
-            slow[0] / np.repeat(noise.sigma, 3),
+            self.slow_steps(noise) * noise.slow_transitions(self.problem.inertial)[1],
+            self.states[0, 3:] / np.repeat(noise.sigma, 3),
             self.start_turn() / HEADING_RAD,
             (self.parameters - self.problem.prior) / self.problem.prior_sigma,
         ]

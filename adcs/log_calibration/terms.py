@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import polar
@@ -57,6 +58,12 @@ class Terms:
         """Return True if all terms of some kinds of a magnetometer are determined."""
         rows = zip(self.names, self.kinds, self.determined, strict=True)
         return all(known for name, kind, known in rows if name.startswith(f"{magnetometer} ") and kind in kinds)
+
+    def without(self, magnetometers: Sequence[str] | None = None) -> Terms:
+        """Return the terms with those of some magnetometers, or all, as not determined by any motion."""
+        ends = None if magnetometers is None else tuple(f"{name} " for name in magnetometers)
+        gone = np.array([ends is None or name.startswith(ends) for name in self.names])
+        return replace(self, largest=np.where(gone, 0.0, self.largest))
 
     def are_determined(self, sigma: FloatArray) -> BoolArray:
         """Return True for the terms whose σ would be small enough."""

@@ -114,7 +114,7 @@ def _inertial(log: Log, kind: str, patterns: Sequence[str]) -> VectorReadings:
     """Return the first sensor that is fast enough, or the one with the most readings."""
     found = list(_candidates(log, patterns))
     if not found:
-        expected = "one of PX4 (sensor_combined, vehicle_imu), ArduPilot (IMU) or ROS (sensor_msgs/Imu)"
+        expected = "one of PX4 (sensor_combined, vehicle_imu), ArduPilot (IMU) or ROS (sensor_msgs/Imu), or a CSV file"
         raise InputError(f"{log.path}: found no {kind}, expected {expected}.")
     fast = (each for each in found if log[each.name].rate_Hz >= _LEAST_RATE_Hz)
     chosen = next(fast, max(found, key=lambda each: len(each.time_s)))

@@ -1,11 +1,13 @@
 """``adcs calibrate-log`` on the log of a simulated flight."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import arrays
+from adcs.log_calibration.fit import fit_log
 from sims.attitude.flights import FlightSettings, simulate_flight
 from tests.adcs.log_calibration.flights import write_flight
 from tests.adcs.refusals import assert_refused
@@ -83,3 +85,9 @@ def test_refusals(adcs, log, tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(tmp_path)
     assert_refused(adcs("calibrate-log", log, *options), words)
     assert not (tmp_path / "mag.toml").exists()
+
+
+def test_fit_that_does_not_converge_writes_no_file(adcs, log, tmp_path, monkeypatch):
+    monkeypatch.setattr("adcs.log_calibration.calibrate.fit_log", lambda *of: replace(fit_log(*of), converged=False))
+    assert_refused(adcs("calibrate-log", log, "--out", tmp_path / "mag.params"), "found a fit that does not converge")
+    assert not (tmp_path / "mag.params").exists()

@@ -9,6 +9,8 @@ import pytest
 from matplotlib import image
 
 import adcs as package
+from arrays import Calibration, Sensor, SensorArray
+from arrays.array_file import write_array
 from arrays.io.csv import read_table, write_columns
 from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
@@ -62,6 +64,21 @@ class TestImu:
         assert 0.2 < found["auto"]["disturbed_fraction"] < 0.4
         squares = found["auto"]["heading_rms_deg"] ** 2 + found["auto"]["inclination_rms_deg"] ** 2
         assert found["auto"]["total_rms_deg"] ** 2 == pytest.approx(squares, rel=0.02)
+
+    def test_calibration(self, adcs, log, tmp_path):
+        """A log with hard and soft iron and its calibration give the attitude of the log without."""
+        table = read_table(log, "a log")
+        columns = dict(zip(table.header, table.values.T, strict=True))
+        scale, offset_nT = np.array([[1.1, 0.05, 0.0], [0.0, 0.9, 0.02], [0.0, 0.0, 1.05]]), [9000.0, -7000.0, 4000.0]
+        names = [f"field_{axis}_nT" for axis in "xyz"]
+        read = np.stack([columns[name] for name in names], axis=1) @ scale.T + offset_nT
+        write_columns(columns | dict(zip(names, read.T, strict=True)), tmp_path / "iron.csv")
+        calibration = Calibration.of("vector", scale, 1e-9 * np.array(offset_nT))
+        sensor = Sensor("field", "vector", (0.0, 0.0, 0.0), 1e-7, calibration=calibration)
+        write_array(tmp_path / "mag.toml", SensorArray((sensor,), common_field_T=7e-5))
+        clean = json.loads(adcs("imu", log, "--json").out)
+        mended = json.loads(adcs("imu", tmp_path / "iron.csv", "--calibration", tmp_path / "mag.toml", "--json").out)
+        assert mended["total_rms_deg"] == pytest.approx(clean["total_rms_deg"], rel=1e-6)
 
     def test_words(self, adcs, log):
         outcome = adcs("imu", log, "--offline", "--quiet")

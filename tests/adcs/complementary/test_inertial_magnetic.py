@@ -224,6 +224,16 @@ class TestDoor:
         track = inertial_magnetic_filter(*readings, offline=offline)
         assert np.degrees(quaternion.angle_between(track.q, q)).max() < 2.0
 
+    def test_heading_before_the_first_field(self):
+        """The heading is unknown until the magnetometer is read; it is within four σ from then on."""
+        record, q, _ = motion(20.0)
+        field_T = np.where(np.arange(len(q))[:, None] < 7, np.nan, record.field_T)
+        readings = record.time_s, record.rate_rad_s, record.acceleration_m_s2, field_T
+        track = inertial_magnetic_filter(*readings)
+        assert (track.sigma["level"][:7, 2] > 1.0).all()
+        error = quaternion.angle_between(track.q, q)
+        assert (error[7:] < 4.0 * np.linalg.norm(track.sigma["level"][7:], axis=1)).all()
+
     def test_refusals(self):
         time_s, ones = DT * np.arange(200), np.ones((200, 3))
         with pytest.raises(ValueError, match=r"magnet must be one of .*; instead received 'left'"):

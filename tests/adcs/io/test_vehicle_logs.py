@@ -11,7 +11,7 @@ import adcs
 import arrays
 from sims.attitude.flights import FlightSettings, simulate_flight
 from tests.adcs.log_calibration.flights import write_flight
-from tests.written_logs import ulog
+from tests.written_logs import dataflash, ulog
 
 FLIGHT = simulate_flight(2, FlightSettings(duration_s=30.0, magnetometers=2))
 
@@ -190,3 +190,65 @@ class TestPx4:
     def test_layout_is_refused(self, tmp_path):
         with pytest.raises(arrays.InputError, match="binary log with a layout"):
             adcs.read_vehicle(px4_log(tmp_path / "log.ulg"), tmp_path / "log.toml")
+
+
+OFS_mG, DIA, ODI = [[120.0, -80.0, 35.0], [-60.0, 10.0, 5.0]], [0.9, 1.1, 1.05], [0.02, -0.03, 0.04]
+
+
+def ardupilot_log(path, *, learned_mG=0.0):
+    """Write a flight as ArduPilot logs it, with two compasses; their parameters stand in the other order."""
+    log = FLIGHT.log
+    stamp = (1e6 * log.time_s + 5e6).astype("u8")
+    columns = {"TimeUS": stamp, "I": np.zeros(len(stamp), "u1")}
+    for name, values in (("Gyr", log.gyro_rad_s), ("Acc", log.acceleration_m_s2)):
+        columns |= {f"{name}{axis}": values[:, i].astype("f4") for i, axis in enumerate("XYZ")}
+    (xx, yy, zz), (xy, xz, yz) = DIA, ODI
+    S = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    rows = []
+    for k, series in enumerate(log.magnetometers):
+        motor = np.outer(np.sin(series.time_s), [30.0, -20.0, 10.0]).round()
+        field = (1e7 * series.values + OFS_mG[k]) @ S.T + motor
+        parts = {"Mag": field, "Ofs": np.tile(np.array(OFS_mG[k]) + learned_mG, (len(field), 1)), "MO": motor}
+        rows.append(
+            {"TimeUS": (1e6 * series.time_s + 5e6).astype("u8"), "I": np.full(len(field), k, "u1")}
+            | {
+                f"{part}{axis}": of[:, i].round().astype("i2")
+                for part, of in parts.items()
+                for i, axis in enumerate("XYZ")
+            }
+        )
+    parameters = {}
+    for slot, k in (("", 1), ("2", 0)):
+        for kind, three in (("OFS", OFS_mG[k]), ("DIA", DIA), ("ODI", ODI)):
+            parameters |= {f"COMPASS_{kind}{slot}_{axis}": value for axis, value in zip("XYZ", three, strict=True)}
+        parameters[f"COMPASS_DEV_ID{slot}"] = 70.0 + k
+    mag = {name: np.concatenate([one[name] for one in rows]) for name in rows[0]}
+    order = np.argsort(mag["TimeUS"], kind="stable")
+    parm = {
+        "TimeUS": stamp[:1].repeat(len(parameters)),
+        "Name": np.array([name.encode() for name in parameters], "S16"),
+        "Value": np.float32(list(parameters.values())),
+    }
+    messages = (
+        ("PARM", parm, "s--", "F--"),
+        ("IMU", columns, "s#EEEooo", "F-000000"),
+        ("MAG", {name: of[order] for name, of in mag.items()}, "s#GGGGGGGGG", "F-CCCCCCCCC"),
+    )
+    path.write_bytes(dataflash(messages))
+    return path
+
+
+class TestArdupilot:
+    def test_corrections_of_the_parameters_are_taken_out(self, tmp_path):
+        """ArduPilot logs S (raw + offset) + motor as whole milligauss; the offsets tell which parameters are used."""
+        file = adcs.read_vehicle(ardupilot_log(tmp_path / "log.bin"))
+        assert not file.is_corrected
+        assert [one.device_id for one in file.log.magnetometers] == [70, 71]
+        for one, true in zip(file.log.magnetometers, FLIGHT.log.magnetometers, strict=True):
+            np.testing.assert_allclose(one.values, true.values, atol=0.7e-7)
+
+    def test_offsets_that_were_learned_in_flight(self, tmp_path):
+        """No parameters have the logged offsets: the fields stay as they are, with a warning."""
+        file = adcs.read_vehicle(ardupilot_log(tmp_path / "log.bin", learned_mG=7.0))
+        assert file.is_corrected
+        assert "adds to its parameters" in file.warnings[0]

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
 import adcs
+from adcs.log_calibration.fit import fit_log
 from adcs.log_calibration.terms import term_values
 from sims.attitude.flights import FlightSettings, simulate_flight
 from tests.adcs.log_calibration.flights import FIELD_T, calibrated, parameter_errors
@@ -143,8 +144,9 @@ class TestFaults:
         values[3000:3300] = np.nan
         log = replace(flight.log, magnetometers=(replace(mag, values=values),))
         found = adcs.calibrate_log(log, field_T=FIELD_T)
-        assert len(found.flags) == 1
-        assert "as by a magnet nearby" in found.flags[0]
+        assert len(found.flags) == 2
+        assert "no readings from 120.0 to 132.0 s" in found.flags[0]
+        assert "as by a magnet nearby" in found.flags[1]
         error, covariance = parameter_errors(flight, found)
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
 
@@ -180,7 +182,7 @@ class TestFaults:
             ).flags
         except ValueError as error:
             words = (str(error),)
-        assert any(f"fit with {'xyz'[axis]} reversed" in word or "check signs, axes" in word for word in words)
+        assert any("fit with an axis reversed" in word or "check signs, axes" in word for word in words)
         assert not any("ROT" in word for word in words)
 
     def test_equal_readings(self):
@@ -190,6 +192,32 @@ class TestFaults:
             adcs.calibrate_log(
                 replace(log, magnetometers=(replace(mag, values=np.full_like(mag.values, 1e-5)),)), field_T=FIELD_T
             )
+
+    @pytest.mark.parametrize("value_T", [0.0, 2e-5, np.nan])
+    def test_magnetometer_that_stops(self, value_T):
+        """A sensor that stands at one value, at zero or reads nothing is left out from then on, and named."""
+        flight = simulate_flight(9, replace(SHORT, magnetometers=2))
+        log, (good, bad) = flight.log, flight.log.magnetometers
+        values = np.where(bad.time_s[:, None] > 30.0, value_T, bad.values)
+        found = adcs.calibrate_log(replace(log, magnetometers=(good, replace(bad, values=values))), field_T=FIELD_T)
+        words = "mag1 has no readings from 30.0" if np.isnan(value_T) else "mag1 stands at one value from 30.0"
+        assert any(words in flag for flag in found.flags)
+        error, covariance = parameter_errors(flight, found)
+        assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
+
+    def test_log_without_currents(self):
+        flight = simulate_flight(1, replace(SHORT, duration_s=30.0))
+        found = adcs.calibrate_log(replace(flight.log, currents=()), field_T=FIELD_T)
+        assert any("no current or throttle" in flag for flag in found.flags)
+
+    def test_fit_that_does_not_converge(self, monkeypatch):
+        """No term counts as determined."""
+        monkeypatch.setattr(
+            "adcs.log_calibration.calibrate.fit_log", lambda *of: replace(fit_log(*of), converged=False)
+        )
+        found = adcs.calibrate_log(simulate_flight(1, replace(SHORT, duration_s=30.0)).log, field_T=FIELD_T)
+        assert len(found.undetermined) == len(found.terms.names)
+        assert "did not converge" in found.flags[0]
 
     def test_clock_that_jumps_by_months(self):
         """All readings of the magnetometer are before the jump or in the gap."""
