@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ WRITTEN = [
     REPOSITORY / "README.md",
     REPOSITORY / "CONTRIBUTING.md",
     *(page for page in sorted((REPOSITORY / "docs").rglob("*.md")) if not {"names", "commands"} & set(page.parts)),
+    *sorted((REPOSITORY / "notebooks").glob("*.ipynb")),
 ]
 MOST_WORDS, MOST_WORDS_OF_A_PAGE, MOST_BYTES = 20.0, 24.0, 12 * 1024
 
@@ -51,6 +53,14 @@ def paragraphs(text: str) -> Iterator[str]:
             lines.append(ITEM.sub("", shown, count=1) if ITEM.match(shown) else shown)
 
 
+def prose_of(page: Path) -> str:
+    """Text of a page, or of the Markdown cells of a notebook."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix != ".ipynb":
+        return text
+    return "\n\n".join("".join(cell["source"]) for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown")
+
+
 def words_of_sentences(text: str) -> list[int]:
     """Number of words of each sentence of three words or more; a code span is one word."""
     sentences = [sentence for paragraph in paragraphs(text) for sentence in END.split(paragraph)]
@@ -66,11 +76,11 @@ class TestSentences:
 
     @pytest.mark.parametrize("page", WRITTEN, ids=lambda page: str(page.relative_to(REPOSITORY)))
     def test_of_a_page_are_short(self, page: Path) -> None:
-        counts = words_of_sentences(page.read_text(encoding="utf-8"))
+        counts = words_of_sentences(prose_of(page))
         assert sum(counts) <= MOST_WORDS_OF_A_PAGE * len(counts)
 
     def test_of_all_pages_are_short(self) -> None:
-        counts = [count for page in WRITTEN for count in words_of_sentences(page.read_text(encoding="utf-8"))]
+        counts = [count for page in WRITTEN for count in words_of_sentences(prose_of(page))]
         assert len(counts) > 2000
         assert sum(counts) <= MOST_WORDS * len(counts)
 

@@ -16,7 +16,7 @@ from adcs.stars.identification import NoFix
 from arrays.typing import ByteArray, FloatArray
 
 SETTLING_S = 10.0
-"""Time of the first transient, which scales ignore."""
+"""End of the first transient, which the scales of the plots ignore."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,7 +89,7 @@ class Rows:
     counts : ndarray of int, shape (n,)
         Number of differences of each row.
     transforms, transform_of_row : ndarray, shapes (m, k, n_channels) and (n,)
-        Matrices from channels to differences, and the index of that of each row.
+        Matrices from channels to differences, and for each row the index of its matrix.
     effects : ndarray, shape (n or 1, k, n_nuisances)
         Effects of nuisances on the readings.
     origins_m, rotations : ndarray, shapes (n, 3) and (n, 3, 3)
