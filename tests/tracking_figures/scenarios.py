@@ -14,7 +14,6 @@ STORED = Path(__file__).with_name("figures.json")
 QUICK = (
     "paper",
     "weaving",
-    "gaps",
     "carrier, vectors",
     "known modulus, 8 m",
     "one magnet, auto",

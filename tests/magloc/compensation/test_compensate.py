@@ -165,11 +165,15 @@ class TestCalibration:
         inside = slice(20, 1480)
         np.testing.assert_allclose(found.values_T[inside, 0], whole.values_T[inside, 0], atol=0.1e-9)
 
-    def test_a_log_that_does_not_follow_its_correction_is_flagged(self) -> None:
-        """Axes that are mirrored after the calibration; and half the field of the platform: a slope of a half."""
-        rows, truth = calm().readings, calm().truth_T[:, None]
+    @pytest.mark.slow
+    def test_axes_that_are_mirrored_after_the_calibration_are_flagged(self) -> None:
+        rows = calm().readings
         mirrored = Readings(rows.values_T * [1.0, 1.0, -1.0, 1.0], time_s=rows.time_s)
         assert flagged(magloc.compensate(ARRAY, mirrored, calibration=rows), "mismatch")
+
+    def test_a_log_that_does_not_follow_its_correction_is_flagged(self) -> None:
+        """Half the field of the platform: a slope of a half."""
+        rows, truth = calm().readings, calm().truth_T[:, None]
         values = rows.values_T.copy()
         values[:, :1] = truth + 0.5 * (values[:, :1] - truth)
         found = magloc.compensate(ARRAY, changed(values), calibration=rows)
