@@ -79,8 +79,12 @@ def header_and_rows(
     labels = list(_labels(rows, first, columns))
     marks = [re.escape(mark) + (_NOT_WORDS if mark == "#" else "") for mark in (*columns.comment, *columns.skip)]
     headers = re.escape(line) + "$" if line else ""
-    for called, pattern in (("repeated headers", headers), ("remarks and names", "|".join(marks))):
-        if pattern:
+    begins = (*columns.comment, *columns.skip)
+    for called, pattern, words in (
+        ("repeated headers", headers, (line,)),
+        ("remarks and names", "|".join(marks), begins),
+    ):
+        if pattern and any(word in rows for word in words):  # the search for a text is far faster than for a pattern
             rows, n = re.subn(rf"^[ \t]*(?:{pattern}).*", "", rows, flags=re.MULTILINE)
             found += [f"{n} lines of {called} are left out"] * (n > 0)
     _refuse_another_header(rows, name, first, columns, wanted)

@@ -134,12 +134,12 @@ def _corrected(log: PlatformLog, fits: Mapping[str, PlatformFit]) -> tuple[Float
             assert attitude is not None
             used = attitude
         coarse = np.column_stack(_correction(log, sensor, fit, used, coarse_s))
-        h, unit, effect, deviation = np.split(_between(coarse_s, coarse, time_s), [3, 6, 7], axis=1)
+        h, along, effect, deviation = np.split(_between(coarse_s, coarse, time_s), [3, 6, 7], axis=1)
         jumps = log.jumps @ fit.terms.current_fields(fit.coefficients)
         if sensor.kind == "vector":
             change = log.factors[sensor.id] * (h + jumps) @ gain.T
         else:
-            change = (effect + np.sum(unit * jumps, axis=1, keepdims=True)) * gain[:, :1].T
+            change = (effect + np.sum(along * jumps, axis=1, keepdims=True)) * gain[:, :1].T
         values[:, channels] = log.readings.values_T[:, channels] - change
         sigma[:, i] = deviation[:, 0]
     return values, sigma
@@ -148,7 +148,10 @@ def _corrected(log: PlatformLog, fits: Mapping[str, PlatformFit]) -> tuple[Float
 def _correction(
     log: PlatformLog, sensor: Sensor, fit: PlatformFit, attitude: Attitude, time_s: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the platform's field and the ambient unit vector (n, 3), the effect on the modulus, and its σ (n,)."""
+    """Return the platform's field and the unit vector of the total (n, 3), the effect on the modulus, and its σ (n,).
+
+    A fast change of a current changes the modulus by its component along the total field.
+    """
     sampled_s, samples = log.signals[sensor.id].samples()
     known = np.isfinite(attitude.at(sampled_s + fit.lag_s)[0]).all(axis=1)
     known &= np.isfinite(currents_at(log.currents, sampled_s)).all(axis=1)
@@ -171,7 +174,9 @@ def _correction(
     changes = columns - np.nanmean(columns, axis=0)
     variance = np.einsum("nq,qr,nr->n", changes, fit.joint_covariance, changes)
     h = fit.terms.fields(field, rate, currents) @ fit.coefficients
-    return h, unit, effect, np.sqrt(np.maximum(variance, 0.0))
+    total = field + h
+    along = total / np.linalg.norm(total, axis=1, keepdims=True)
+    return h, along, effect, np.sqrt(np.maximum(variance, 0.0))
 
 
 def _between(coarse_s: FloatArray, values: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -145,8 +145,8 @@ def survey(
         with_offsets = tiled.with_likeliest_offsets()
         again = tiled.changes() if with_offsets is tiled else range(len(tiled.tiles))
         tiled, _ = with_offsets.settle(strongest_sources, each, tell, again)
-        _warn_of_order(array, tiled.readings)
-        clock = shift_of_places(array, tiled.readings)
+        _warn_of_order(tiled.array, tiled.readings)
+        clock = shift_of_places(tiled.array, tiled.readings)
         tiled, lag = tiled.correct_lag(assumed)
         if clock is not None and clock.s and (clock.is_leap or not lag.s):
             _LOG.warning(clock.warning)
