@@ -176,5 +176,5 @@ test-oldest: .venv-oldest/installed chromium
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-oldest .venv-supply build dist magloc/core/kernels.* magloc/core/_declarations.py *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/names
+	rm -rf .venv .venv-oldest .venv-supply build dist magloc/core/kernels.* magloc/core/_declarations.py *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/headers docs/reference/names
 	find . -name __pycache__ -prune -exec rm -rf {} +

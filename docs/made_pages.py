@@ -15,6 +15,7 @@ from typing import Any
 
 from docutils import nodes
 from explained import CARD, EXPLAINED, PICTURES
+from header_pages import HEADERS, header_text
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 
@@ -47,7 +48,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
 
 
 def make_all(app: Sphinx) -> None:
-    """Write what git does not keep: lists of names, commands, notebooks and their cards, MathJax."""
+    """Write what git does not keep: lists of names, commands, headers, notebooks and their cards, MathJax."""
     names = fresh(HERE / "reference" / "names")
     lists = reference_lists()
     for page, sections in lists.items():
@@ -60,6 +61,9 @@ def make_all(app: Sphinx) -> None:
     commands = fresh(HERE / "reference" / "commands")
     for name, text in command_pages():
         (commands / f"{name.replace(' ', '-')}.md").write_text(text, encoding="utf-8")
+    headers = fresh(HERE / "reference" / "headers")
+    sections = (header_text(HERE.parent / "magloc" / "core" / "include", name) for name in HEADERS)
+    (headers / "all.txt").write_text("\n".join(sections), encoding="utf-8")
     notebooks = fresh(HERE / "gallery" / "notebooks")
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
         notebook = json.loads(path.read_text(encoding="utf-8"))

@@ -196,7 +196,12 @@ def names() -> list[str]:
     )
     made_pages = {
         Path(REPOSITORY, "docs", *place)
-        for place in (("reference", "names"), ("reference", "commands"), ("gallery", "notebooks"))
+        for place in (
+            ("reference", "names"),
+            ("reference", "commands"),
+            ("reference", "headers"),
+            ("gallery", "notebooks"),
+        )
     }
     found = []
     for folder, folders, files in os.walk(REPOSITORY):

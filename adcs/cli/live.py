@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,6 +12,7 @@ from cyclopts import Parameter
 from adcs.cli.imu import MAGNETS
 from arrays.io.errors import LARGEST
 from magloc.cli.framework import ABOVE_ZERO, QuietOptions, note, print_json, refuse_outside
+from magloc.cli.live import PageOptions, open_page_of
 from magloc.cli.options import STREAM
 
 
@@ -21,6 +23,7 @@ def live(
     method: Literal["auto", "plain", "reject", "subtract"] = "auto",
     lag_s: float = 0.0,
     replay_speed: float = 1.0,
+    page: PageOptions = PageOptions(),  # noqa: B008 - frozen
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen; the framework reads it
 ) -> None:
     """Estimate the attitude of an inertial unit while readings arrive.
@@ -43,6 +46,8 @@ def live(
         Lag of the magnetometer behind the gyro [s], at most 0.04; adcs.AttitudeConfig.from_log measures it.
     replay_speed : float
         Speed of a replay, over that of the recording.
+    page : PageOptions
+        Page that shows attitude, σ and disturbance.
     common : QuietOptions
         Common options.
     """
@@ -52,11 +57,21 @@ def live(
     refuse_outside(0.0, LONGEST_LAG_S, f"0 to {LONGEST_LAG_S:g} s", unit=" s", lag_s=lag_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
     stream = ImuStream(config, magnet=MAGNETS[method], lag_s=lag_s)
-    try:
-        for estimate in stream.follow(source, replay_speed=replay_speed):
-            print_json(entry_of(estimate))
-            sys.stdout.flush()
-    finally:
-        if (tally := stream.tally).rows:
-            rows = f"{tally.rows} rows, {tally.late} late, {tally.garbled} garbled, {tally.doubled} doubled"
-            note(f"{rows}, clock set back {tally.restarts} times")
+    with ExitStack() as open_page:
+        view = None
+        if page.view:
+            from adcs.viewer.live_attitude import LiveAttitudeView
+
+            view = open_page.enter_context(open_page_of(LiveAttitudeView, page))
+        try:
+            for estimate in stream.follow(source, replay_speed=replay_speed):
+                print_json(entry_of(estimate))
+                sys.stdout.flush()
+                if view is not None:
+                    view.update(estimate, stream.tally)
+        finally:
+            if (tally := stream.tally).rows:
+                rows = f"{tally.rows} rows, {tally.late} late, {tally.garbled} garbled, {tally.doubled} doubled"
+                note(f"{rows}, clock set back {tally.restarts} times")
+        if view is not None:
+            view.wait()

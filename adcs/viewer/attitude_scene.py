@@ -8,6 +8,7 @@ import viser
 
 from adcs import quaternion
 from adcs.viewer.attitude_replay import AttitudeReplay
+from arrays.typing import FloatArray
 from magloc.viewer.scene.framing import Extent, extent_of
 from magloc.viewer.scene.glyphs import add_label, add_lines, add_mesh, show_segments
 from magloc.viewer.scene.legend import Colour, Swatch
@@ -64,7 +65,12 @@ class AttitudeScene:
         )
         self._names = [add_label(scene, f"/name-{i}", one.name, np.zeros(3)) for i, (one, _) in directions]
         self._trail = add_lines(scene, "/trail", np.zeros((1, 2, 3)), _AXIS_COLOURS[0], 1.5, visible=False)
-        self._tips = _AXIS * quaternion.to_rotation(replay.q).apply([1.0, 0.0, 0.0])
+        self._tips = _tips(replay)
+
+    def replace(self, replay: AttitudeReplay) -> None:
+        """Show the last row of another replay, with the same directions."""
+        self._replay, self._tips = replay, _tips(replay)
+        self.show(len(replay.time_s) - 1)
 
     def show(self, row: int) -> None:
         """Show a row of the replay."""
@@ -88,6 +94,11 @@ class AttitudeScene:
         first = int(np.searchsorted(replay.time_s, replay.time_s[row] - _TRAIL_S))
         rows = np.arange(first, row + 1)[:: max(1, (row - first) // _TRAIL_ROWS)]
         show_segments(self._trail, line_segments(self._tips[rows]))
+
+
+def _tips(replay: AttitudeReplay) -> FloatArray:
+    """Return the ends (n, 3) of the body axis x, which leaves a trail."""
+    return np.asarray(_AXIS * quaternion.to_rotation(replay.q).apply([1.0, 0.0, 0.0]))
 
 
 def attitude_extent() -> Extent:

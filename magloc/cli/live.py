@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 from cyclopts import Parameter
 
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
     from arrays.io.csv import Column
     from magloc.live.follower import Follower, LivePoint
     from magloc.viewer.live_view import LiveView
+    from magloc.viewer.view import View
 
+_Live = TypeVar("_Live", bound="View")
 _SWITCH_S = 5e-4
 """Time after which a thread of the page yields to the tracker."""
 
@@ -165,8 +169,13 @@ def open_live_page(follower: Follower, page: PageOptions) -> LiveView:
     """Open a page of a tracker, and print its address."""
     import magloc.viewer
 
+    return open_page_of(partial(magloc.viewer.LiveView, follower.array, controls=follower), page)
+
+
+def open_page_of(make: Callable[..., _Live], page: PageOptions) -> _Live:
+    """Open a page that takes a port and whether to open a browser, and print its address."""
     with naming_options("port"):
-        view = magloc.viewer.LiveView(follower.array, controls=follower, port=page.port, open=page.open)
+        view = make(port=page.port, open=page.open)
     sys.setswitchinterval(_SWITCH_S)
     note(f"open {view.address} in a browser; Ctrl-C ends the page")
     return view

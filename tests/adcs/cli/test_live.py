@@ -11,6 +11,7 @@ import pytest
 
 import adcs as package
 from adcs.io.imu_streams import ImuStream
+from adcs.viewer.live_attitude import LiveAttitudeView
 from tests.adcs.refusals import assert_refused
 from tests.command_line import Run
 
@@ -89,6 +90,17 @@ class TestCommand:
         q = [[row[name] for name in ("qw", "qx", "qy", "qz")] for row in rows]
         np.testing.assert_allclose(q, [one.q for one in expected()], rtol=0, atol=1e-9)
         assert "400 rows, 0 late, 0 garbled" in outcome.err
+
+    def test_a_page(self, adcs: Run, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:  # type: ignore[no-untyped-def]
+        """It stays after the last row until Ctrl-C."""
+        shown = []
+        monkeypatch.setattr(LiveAttitudeView, "update", lambda _, estimate, tally: shown.append(estimate.time_s))
+        monkeypatch.setattr(LiveAttitudeView, "wait", lambda _: shown.append("waits"))
+        (tmp_path / "log.csv").write_text("\n".join(LINES), encoding="utf-8")
+        outcome = adcs("live", "--from", f"replay:{tmp_path / 'log.csv'}", "--replay-speed", "1e9", "--view")
+        assert outcome.status == 0, outcome.err
+        assert "open http://" in outcome.err
+        assert shown == [*(one.time_s for one in expected()), "waits"]
 
     def test_refusals(self, adcs: Run, monkeypatch: pytest.MonkeyPatch) -> None:
         assert_refused(adcs("live", "--lag-s", "1"), "--lag-s: found 1 s, expected 0 to 0.04 s")
