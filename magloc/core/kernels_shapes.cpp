@@ -1,67 +1,13 @@
 // Fields of magnets of known shape.
 #include "magloc/dipole.hpp"
 #include "magloc/kernel.hpp"
-#include "magloc/shapes.hpp"
-
-MAGLOC_BEGIN
-// A body's shape, and the distance from which its field is a series.
-class Body {
-  int64_t shape_;
-  double size_[3], multipoles_[n_multipoles], far_square_;
-
-  // Fill the derivatives outside, near or far; both if lanes differ.
-  template <class Near, class Far>
-  MAGLOC_INLINE void fill(const Lanes (&d)[3], PotentialDerivatives<Lanes> &phi, Near near, Far far) const {
-    const Mask is_far = dot(d, d) > far_square_;
-    if (any_lane(is_far)) far(phi);
-    if (all_lanes(is_far)) return;
-    PotentialDerivatives<Lanes> other;
-    near(any_lane(is_far) ? other : phi);
-    if (!any_lane(is_far)) return;
-    for (int i = 0; i < 3; ++i)
-      for (int j = 0; j < 3; ++j) {
-        phi.second[i][j] = choose(is_far, phi.second[i][j], other.second[i][j]);
-        for (int k = 0; k < 3; ++k) phi.third[i][j][k] = choose(is_far, phi.third[i][j][k], other.third[i][j][k]);
-      }
-  }
-
- public:
-  explicit Body(const magloc_magnets &p) : shape_(p.shape), multipoles_{} {
-    double longest = 0.0;
-    for (int i = 0; i < 3; ++i) size_[i] = p.size[i], longest = maximum(longest, 2.0 * size_[i]);
-    if (shape_ == 1) fill_multipoles(size_, multipoles_);
-    // The errors of the series and of the rounding in the closed forms cross there, near 1e-11.
-    far_square_ = shape_ == 1 ? 100.0 * (size_[1] * size_[1] + size_[2] * size_[2]) : 225.0 * longest * longest;
-  }
-
-  MAGLOC_INLINE void fill(const Lanes (&d)[3], PotentialDerivatives<Lanes> &phi) const {
-    if (shape_ == 0)
-      fill(
-          d, phi, [&](auto &near) { fill_cuboid(size_, d, near); }, [&](auto &far) { fill_far_cuboid(size_, d, far); });
-    else if (shape_ == 1)
-      fill(
-          d, phi, [&](auto &near) { fill_ring(size_, d, near); },
-          [&](auto &far) { fill_far_ring(multipoles_, d, far); });
-    else
-      phi = {}, add_dipole(d, 1.0, phi);
-  }
-
-  // How far outside a point is, in one of the coordinates that bound the body; not above zero inside.
-  MAGLOC_INLINE Lanes outside(const Lanes (&d)[3]) const {
-    const Lanes s = d[0] * d[0] + d[1] * d[1], rho = square_root(s);
-    if (shape_ == 2) return square_root(s + d[2] * d[2]) - size_[0];
-    const Lanes along = absolute(d[2]) - size_[2];
-    if (shape_ == 1) return maximum(along, maximum(rho - size_[1], size_[0] - rho));
-    return maximum(along, maximum(absolute(d[0]) - size_[0], absolute(d[1]) - size_[1]));
-  }
-};
-MAGLOC_END
+#include "magloc/magnets.hpp"
 
 using namespace magloc;
 
 MAGLOC_KERNEL(shape_fields, magnets) {
   if (!workspace) return 0;
-  const Body body(*problem);
+  const Body<Lanes> body(problem->shape, problem->size);
   for (int64_t i = begin; i < end; i += n_lanes<Lanes>) {
     Lanes d[3], m[3];
     for (int a = 0; a < 3; ++a) {
@@ -83,6 +29,34 @@ MAGLOC_KERNEL(shape_fields, magnets) {
         }
       }
     }
+  }
+  return 0;
+}
+
+MAGLOC_KERNEL(aligned_fields, aligned_magnets) {
+  if (!workspace) return 0;
+  const Body<Lanes> body(problem->shape, problem->size);
+  for (int64_t i = begin; i < end; i += n_lanes<Lanes>) {
+    Lanes d[3], m[3];
+    for (int a = 0; a < 3; ++a) {
+      d[a] = load_component<Lanes>(problem->points, i, end, a);
+      m[a] = load_component<Lanes>(problem->moments, i, end, a);
+    }
+    Lanes roll[2]{};
+    for (int lane = 0; problem->rolls && lane < n_lanes<Lanes>; ++lane)
+      for (int a = 0; a < 2; ++a)
+        set_lane(roll[a], lane, problem->rolls[2 * (i + lane < end ? i + lane : end - 1) + a]);
+    const AlignedField<Lanes> found(body, d, m, problem->rolls ? roll : nullptr);
+    for (int lane = 0; lane < n_lanes<Lanes> && i + lane < end; ++lane)
+      for (int a = 0; a < 3; ++a) {
+        const int64_t row = 3 * (i + lane) + a;
+        problem->fields[row] = mu0_over_4pi * get_lane(found.field[a], lane);
+        problem->jacobians[7 * row + 6] = mu0_over_4pi * get_lane(found.by_roll[a], lane);
+        for (int b = 0; b < 3; ++b) {
+          problem->jacobians[7 * row + b] = mu0_over_4pi * get_lane(found.by_position[a][b], lane);
+          problem->jacobians[7 * row + 3 + b] = mu0_over_4pi * get_lane(found.by_moment[a][b], lane);
+        }
+      }
   }
   return 0;
 }

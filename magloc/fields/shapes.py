@@ -66,12 +66,12 @@ class Shape:
         object.__setattr__(self, "size_m", tuple(float(size) for size in np.atleast_1d(self.size_m)))
         names = _SIZES[self.kind]
         if len(self.size_m) != 1 + names.count(",") + 2 * (self.kind == "cuboid"):
-            raise ValueError(f"Input size_m of a {self.kind} must hold {names}; instead received {[*self.size_m]}.")
+            raise ValueError(f"Input size_m must be the {names} of a {self.kind}; instead received {[*self.size_m]}.")
         if not all(0.0 < size < math.inf for size in self.size_m):
             raise ValueError(f"Input size_m must be positive and finite; instead received {[*self.size_m]}.")
         if self.kind == "ring" and self.size_m[0] >= self.size_m[1]:
             raise ValueError(
-                "Input size_m of a ring must have an inner diameter below the outer one;"
+                "Input size_m must be those of a ring with an inner diameter below the outer one;"
                 f" instead received {[*self.size_m]}."
             )
 
@@ -81,9 +81,17 @@ class Shape:
         width = self.size_m[-2:] if self.kind in ("cylinder", "ring") else self.size_m
         return math.hypot(*width)
 
+    def check_aligned(self) -> None:
+        """Raise ValueError for a cuboid with unequal edges across its last one, along which it is magnetised."""
+        if self.kind == "cuboid" and not math.isclose(*self.size_m[:2], rel_tol=1e-6):
+            raise ValueError(
+                "Input size_m must be edges of which the first two are equal, across the magnetisation of the cuboid;"
+                f" instead received {[*self.size_m]}."
+            )
+
     @cached_property
-    def _kernel_size(self) -> tuple[int, tuple[float, float, float]]:
-        """Return the number of the shape, and its size as the kernel takes it."""
+    def kernel_size(self) -> tuple[int, tuple[float, float, float]]:
+        """Number of the shape, and its size, for kernels."""
         half = [0.5 * size for size in self.size_m]
         if self.kind == "cuboid":
             return 0, (half[0], half[1], half[2])
@@ -142,7 +150,7 @@ def fields_or_nan(
     points, moments = np.broadcast_arrays(_vectors("points_m", points_m), _vectors("moment_Am2", moment_Am2))
     axes, number = points.shape[:-1], points.size // 3
     field, by_point, by_moment = np.empty((number, 3)), np.empty((number, 3, 3)), np.empty((number, 3, 3))
-    kind, size = shape._kernel_size
+    kind, size = shape.kernel_size
     work = core.problem(
         "magnets",
         n_points=number,
@@ -156,3 +164,49 @@ def fields_or_nan(
     )
     core.run("shape_fields", work, number, block=_POINTS_A_BLOCK)
     return field.reshape(*axes, 3), by_point.reshape(*axes, 3, 3), by_moment.reshape(*axes, 3, 3)
+
+
+def aligned_fields(
+    shape: Shape,
+    points_m: ArrayLike,
+    position_m: ArrayLike,
+    moment_Am2: ArrayLike,
+    roll_rad: ArrayLike | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the field of a magnet that is magnetised along its z axis, and its Jacobian by position, moment and roll.
+
+    The magnet turns with its moment. A cuboid must have equal edges across the moment. Its roll about the moment is
+    from axes that depend on the moment alone; by default its field is the mean over all rolls.
+
+    Parameters
+    ----------
+    points_m, position_m, moment_Am2 : array_like, shape (..., 3)
+        Points, centre of the magnet and its moment in one frame [m], [A·m²].
+    roll_rad : array_like, shape (...), optional
+
+    Returns
+    -------
+    field : ndarray, shape (..., 3)
+        Field [T]; NaN inside the magnet.
+    jacobian : ndarray, shape (..., 3, 7)
+        Its derivatives by (p, m) and by the roll [T/m], [T/(A·m²)], [T/rad].
+    """
+    separation = _vectors("points_m", points_m) - _vectors("position_m", position_m)
+    points, moments = np.broadcast_arrays(separation, _vectors("moment_Am2", moment_Am2))
+    axes, number = points.shape[:-1], points.size // 3
+    field, jacobian = np.empty((number, 3)), np.empty((number, 3, 7))
+    kind, size = shape.kernel_size
+    roll = None if roll_rad is None else np.broadcast_to(np.asarray(roll_rad, dtype=np.float64), axes).ravel()
+    work = core.problem(
+        "aligned_magnets",
+        n_points=number,
+        shape=kind,
+        size=size,
+        rolls=None if roll is None else np.stack([np.cos(roll), np.sin(roll)], axis=-1),
+        points=np.ascontiguousarray(points).reshape(-1, 3),
+        moments=np.ascontiguousarray(moments).reshape(-1, 3),
+        fields=field,
+        jacobians=jacobian,
+    )
+    core.run("aligned_fields", work, number, block=_POINTS_A_BLOCK)
+    return field.reshape(*axes, 3), jacobian.reshape(*axes, 3, 7)

@@ -240,13 +240,13 @@ class TestShape:
         ("kind", "size", "message"),
         [
             ("cone", (1.0,), "kind must be one of cuboid, cylinder, ring, sphere"),
-            ("cuboid", (1.0, 2.0), "size_m of a cuboid must hold three edges"),
-            ("cylinder", (1.0,), "size_m of a cylinder must hold diameter, height"),
-            ("ring", (1.0, 2.0), "size_m of a ring must hold inner diameter, outer diameter, height"),
-            ("sphere", (1.0, 1.0), "size_m of a sphere must hold diameter"),
+            ("cuboid", (1.0, 2.0), "size_m must be the three edges of a cuboid"),
+            ("cylinder", (1.0,), "size_m must be the diameter, height of a cylinder"),
+            ("ring", (1.0, 2.0), "size_m must be the inner diameter, outer diameter, height"),
+            ("sphere", (1.0, 1.0), "size_m must be the diameter of a sphere"),
             ("sphere", (0.0,), "size_m must be positive and finite"),
             ("cuboid", (1.0, 1.0, float("nan")), "size_m must be positive and finite"),
-            ("ring", (2.0, 2.0, 1.0), "inner diameter below the outer one"),
+            ("ring", (2.0, 2.0, 1.0), "those of a ring with an inner diameter below"),
         ],
     )
     def test_bad_sizes(self, kind: str, size: tuple[float, ...], message: str) -> None:
