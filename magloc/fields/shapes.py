@@ -36,7 +36,7 @@ _SIZES = {
     "sphere": "diameter",
 }
 KINDS = tuple(_SIZES)
-_POINTS_A_BLOCK = 4096
+_POINTS_A_BLOCK = 20_000
 
 
 @dataclass(frozen=True)

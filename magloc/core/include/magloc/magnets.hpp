@@ -96,18 +96,12 @@ struct AlignedField {
 
   MAGLOC_INLINE AlignedField(const Body<T> &body, const T (&d)[3], const T (&m)[3], const T *roll = nullptr) {
     const T inverse = inverse_root(dot(m, m)), strength = 1.0 / inverse;
-    // Any two axes across the moment serve; the one of its smallest component is far from it.
-    T axes[3][3] = {};
-    const T x = absolute(m[0]), y = absolute(m[1]), z = absolute(m[2]);
-    const auto x_least = x < minimum(y, z), y_least = y < z;
-    const T one = broadcast<T>(1.0), zero{};
-    const T least[3] = {choose(x_least, one, zero), choose(x_least, zero, choose(y_least, one, zero)),
-                        choose(x_least, zero, choose(y_least, zero, one))};
-    for (int i = 0; i < 3; ++i) axes[2][i] = m[i] * inverse;
-    cross(axes[2], least, axes[0]);
-    const T norm = inverse_root(dot(axes[0], axes[0]));
-    for (T &component : axes[0]) component *= norm;
-    cross(axes[2], axes[0], axes[1]);
+    // The frame's axes by the least turn of its z axis, or of the opposite one where that is ambiguous, to the moment.
+    const T n[3] = {m[0] * inverse, m[1] * inverse, m[2] * inverse}, one = broadcast<T>(1.0);
+    const T sign = choose(n[2] > -0.9999, one, -one), a = -1.0 / (sign + n[2]), mixed = n[0] * n[1] * a;
+    const T axes[3][3] = {{1.0 + sign * n[0] * n[0] * a, sign * mixed, -sign * n[0]},
+                          {mixed, sign + n[1] * n[1] * a, -n[1]},
+                          {n[0], n[1], n[2]}};
     T local[3];
     for (int i = 0; i < 3; ++i) local[i] = dot(axes[i], d);
     PotentialDerivatives<T> phi;
