@@ -321,7 +321,7 @@ class SensorArray:
         """
         _ = self.channel_gain, self.channel_offset_T, self.channel_noise_T, self.circumradius
         kept = {name: value for name, value in vars(self).items() if name not in _OF_AMBIENT_FIELD}
-        other = object.__new__(SensorArray)
+        other = object.__new__(type(self))
         vars(other).update(kept, ambient_T=tuple(_finite("ambient_T", ambient_T, (3,)).tolist()))
         return other
 

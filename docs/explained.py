@@ -36,7 +36,7 @@ EXPLAINED = {
     "robot-logs": "magloc.read_log magloc.Log magloc.LogChannel",
     "stated-uncertainty": "arrays.PoseUncertainty",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
-    " magloc.SourcePrior magloc.plots.fixes",
+    " magloc.SourcePrior magloc.Shape magloc.plots.fixes",
     "sensor-faults": "magloc.plots.residuals",
     "surveys": "magloc.survey magloc.Survey magloc.Target magloc.check_quality magloc.Quality magloc.Terrain"
     " magloc.read_terrain magloc.plots.survey magloc.plots.survey_profiles",

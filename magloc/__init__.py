@@ -36,6 +36,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Readings": "magloc.readings",
         "RepeatedFilter": "magloc.convergence.filters",
         "Review": "magloc.surveying.review.review",
+        "Shape": "magloc.fields.shapes",
         "Signature": "magloc.signature.signature",
         "Solution": "magloc.localization.fit.results",
         "Source": "magloc.localization.fit.results",

@@ -24,6 +24,7 @@ from magloc.directions import moments_on_sphere as moments_on_sphere
 from magloc.fields import dipole as dipole
 from magloc.fields import geomagnetic as geomagnetic
 from magloc.fields.body import equivalent_dipole as equivalent_dipole
+from magloc.fields.shapes import Shape as Shape
 from magloc.live.rest import subtract_rest as subtract_rest
 from magloc.localization.fit.fixes import Fixes as Fixes
 from magloc.localization.fit.prior import SourcePrior as SourcePrior

@@ -15,6 +15,7 @@ from cyclopts import Parameter
 from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
 from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, note, refuse_outside
+from magloc.cli.moments.magnet import MagnetOptions
 from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_place
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ def live(
     page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
+    magnet: MagnetOptions = MagnetOptions(),  # noqa: B008 - frozen
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Track one source, or several, while readings arrive.
@@ -129,16 +131,19 @@ def live(
         Prior knowledge of the sensors, of the source when a track starts, and of the ambient field.
     motion : MotionOptions
         Number of sources, and the model of their motion.
+    magnet : MagnetOptions
+        Shape of a magnet.
     common : QuietOptions
         Common options.
     """
     from arrays.io.outputs import GrowingTable
+    from magloc.measurement.magnet import array_near
 
     refuse_outside(0.0, LARGEST, "0 or a positive number", rest_s=rest_s)
     refuse_outside(ABOVE_ZERO, LARGEST, "a positive number", replay_speed=replay_speed)
     refuse_unwritable(out, "--out", ".csv")
     turning.check(out=out, rest_s=rest_s, sources=motion.sources)
-    used = known.array(array)
+    used = array_near(known.array(array), magnet.shape(sources=motion.sources))
     if turning.calibrate:
         from magloc.cli.calibration.live_turning import calibrate_live
 

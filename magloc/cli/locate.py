@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,6 +15,7 @@ from arrays.io.errors import LARGEST, InputError, own_sentence
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, Flag, note, print_json_list, progress, refuse_outside, warn
+from magloc.cli.moments.magnet import MagnetOptions
 from magloc.cli.options import KnownOptions, ambient_field, number_of_sources
 
 if TYPE_CHECKING:
@@ -48,6 +49,8 @@ class FixOptions:
         of the array's circumradius. 0 for a point source.
     keep_sensors : bool
         Use all sensors, even those that contradict the others.
+    magnet : MagnetOptions
+        Shape of a magnet.
     """
 
     sources: str | None = None
@@ -56,6 +59,7 @@ class FixOptions:
     ambient_gradient: Flag = False
     body_length_m: float | None = None
     keep_sensors: Flag = False
+    magnet: MagnetOptions = field(default_factory=MagnetOptions)
 
     @property
     def n_sources(self) -> int | Literal["auto"]:
@@ -114,6 +118,7 @@ def locate(
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
     length_m, position = wanted.body_length_m, wanted.position
     joint = wanted.sources is not None or (position is not None and len(position) > 1)
+    magnet = wanted.magnet.shape(position=position, body_length_m=length_m)
     refuse_outside(0.0, LARGEST, "a length, or 0 for a point", body_length_m=length_m)
     if position is not None and (wanted.sources is not None or known.region is not None):
         other = "--sources" if wanted.sources is not None else "--region"
@@ -139,6 +144,7 @@ def locate(
                 prior=prior,
                 ambient_T=ambient_T,
                 body_length_m=length_m,
+                magnet=magnet,
                 exclude_faulty=not wanted.keep_sensors,
                 average=wanted.average,
                 rng=common.seed,

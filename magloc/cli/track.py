@@ -21,6 +21,7 @@ from magloc.cli.moments.known_path import (
     refuse_bounds,
     write_moment_tracks,
 )
+from magloc.cli.moments.magnet import MagnetOptions
 from magloc.cli.options import (
     STREAM,
     KnownOptions,
@@ -77,11 +78,14 @@ class PathOptions(MotionOptions):
         results. Only the moment is estimated; it turns with the attitude. Rows outside the path are left out.
     error : PathErrorOptions
         Errors of a known path.
+    magnet : MagnetOptions
+        Shape of a magnet.
     """
 
     position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
+    magnet: MagnetOptions = field(default_factory=MagnetOptions)
 
     def known_path(self) -> ObjectPath | list[Vector] | None:
         """Return the known path or positions; None if the position is to be estimated."""
@@ -198,6 +202,8 @@ def track(
     common : CommonOptions
         Common options.
     """
+    from magloc.measurement.magnet import array_near
+
     if json and jsonl:
         raise InputError("--json: found together with --jsonl, expected one of them.")
     refuse_file(out, "--out")
@@ -211,6 +217,7 @@ def track(
     on_background = conditioning.detrend or conditioning.high_pass_hz is not None
     model = motion.model(lasting=smooth or on_background)
     path = motion.known_path()
+    magnet = motion.magnet.shape(sources=motion.sources, position=motion.position, object_path=motion.object_path)
     if path is not None:
         refuse_bounds(known)
     number = motion.number
@@ -224,7 +231,7 @@ def track(
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         with named:
-            _stream(used, known, motion, where)
+            _stream(array_near(used, magnet), known, motion, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     maps.refuse_far(rows, str(readings))
@@ -243,7 +250,7 @@ def track(
     with progress(len(rows), "rows") as advance, named:
         alike: Any = {"prior": known.prior, "progress": advance, "told": motion.print_entry if jsonl else None}
         if number is None:
-            one = magloc.track(used, rows, motion=model, smooth=smooth, **alike)
+            one = magloc.track(used, rows, motion=model, smooth=smooth, magnet=magnet, **alike)
         else:
             several = magloc.track_sources(used, rows, sources=number, motion=motion.model_of_several(), **alike)
     if number is None:

@@ -28,6 +28,7 @@ from magloc.localization.fit.results import Fix
 from magloc.localization.model_errors import model_errors
 from magloc.localization.reweighting import DEGREES_OF_FREEDOM, LEAST_WEIGHT, WeightedFits
 from magloc.localization.search.multi_source import NOISE_ALONE
+from magloc.measurement.magnet import magnet_of, model_near
 from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
@@ -162,6 +163,7 @@ class _Examination:
         of_rows = whitenings_of(array, mask, readings)
         self.n_differences = of_rows.n_differences
         problem, self.raw = whitened_model(array, mask, readings, of_rows, ambient)
+        problem = model_near(array, problem)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
@@ -180,7 +182,8 @@ class _Examination:
         sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         length_m = np.array([fix.body_length_m for fix in plain])
         errors = []
-        counted = [(row, fix) for row, fix in enumerate(plain) if length_m[row] or sigma_T]
+        always = sigma_T or magnet_of(self.array)
+        counted = [(row, fix) for row, fix in enumerate(plain) if length_m[row] or always]
         for _, rows, q, mu, _ in self._stack(self._starts(counted)):
             lengths = np.tile(length_m[rows, None], q.shape[1])
             errors.append((rows, model_errors(self.problem.rows(rows), q, mu, lengths, sigma_T)))

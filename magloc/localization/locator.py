@@ -9,20 +9,20 @@ import logging
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.io.values import accept_seed, numbers, seed_of
-from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray, IntArray, Rng
 from magloc.ambient import in_world_field
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
 from magloc.conditioning import NO_BACKGROUND
 from magloc.fields.multipole import check_body_length
+from magloc.fields.shapes import Shape
 from magloc.localization.body_errors import body_covariances
 from magloc.localization.dipole_validity import is_too_near
 from magloc.localization.fault_exclusion import exclude_faulty_sensors
@@ -31,22 +31,21 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix
+from magloc.localization.magnet_fit import fit_magnet
 from magloc.localization.model_errors import with_model_errors
-from magloc.localization.search.known_position import MomentSearch
+from magloc.localization.search.known_position import MomentSearch, places_in_array
 from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
 from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch, cached_search
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.magnet import array_near
 from magloc.measurement.nuisances import ambient_in_array, with_eddies_as_offsets
 from magloc.measurement.plausibility import warn_of_doubts, warn_of_moments
-from magloc.measurement.pose import PosesOfRows, rates_of, with_stated_pose
+from magloc.measurement.pose import PosesOfRows, rates_of, with_attitude_as_field_error, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, check_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
 # Rows per block; a search for several sources, or with known moments, has smaller blocks.
@@ -73,6 +72,9 @@ class Locator:
         Length of the object. The deviation of its field from a dipole counts as noise, and fixes nearer than three
         lengths are flagged `too_near`. By default the length is a quarter of the distance if four sensors are nearer
         than 0.6 of the array's circumradius. 0 for a point.
+    magnet : Shape, optional
+        Shape of the source, a magnet that is magnetised along its axis; its field is then exact at any distance. A
+        cuboid has equal edges across its last one, along which it is magnetised.
     exclude_faulty : bool
         Leave out sensors that contradict all others, and name them.
     rng : int or numpy.random.Generator
@@ -101,14 +103,26 @@ class Locator:
         position_m: ArrayLike | None = None,
         prior: SourcePrior = NOTHING_KNOWN,
         body_length_m: float | None = None,
+        magnet: Shape | None = None,
         exclude_faulty: bool = True,
         rng: Rng = 0,
     ) -> None:
         check_body_length(body_length_m or 0.0)
         if position_m is not None and sources != 1:
             raise ValueError(f"Input sources must be 1 where position_m is known; instead received {sources}.")
+        if magnet is not None:
+            magnet.check_aligned()
+            if sources == "auto" or (sources != 1 and magnet.kind == "cuboid"):
+                raise ValueError(
+                    f"Input sources must be 1, or with magnets that do not roll a number; instead received {sources}."
+                )
+            if position_m is not None or body_length_m is not None:
+                raise ValueError(
+                    "Input magnet must come without position_m and body_length_m; instead they came together."
+                )
+            body_length_m = 0.0
         self.array = array
-        self.body_length_m = body_length_m
+        self.body_length_m, self.magnet, self._prior = body_length_m, magnet, prior
         self.exclude_faulty = exclude_faulty
         self._at_once = min(_ROWS_AT_ONCE, max(_ROWS_OF_SEVERAL, _MOST_NUMBERS // array.n_channels**2))
         free = sources == 1 and position_m is None and prior.known_moment_Am2 is None
@@ -170,7 +184,9 @@ class Locator:
         fixes = Fixes.joined(parts)
         if fixes.solutions.position_m.shape[1] > 1 and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
-        near, bodies = is_too_near(self.array, fixes, readings, ambient, self.body_length_m), None
+        near, bodies = np.zeros(len(fixes), dtype=bool), None
+        if self.magnet is None:
+            near = is_too_near(self.array, fixes, readings, ambient, self.body_length_m)
         if self.body_length_m is None:
             known_place = isinstance(self._search, MomentSearch)
             bodies = partial(body_covariances, self.array, fixes, readings, ambient, known_place=known_place)
@@ -186,7 +202,8 @@ class Locator:
         if not self.exclude_faulty:
             return fixes
         free = not isinstance(self._search, MomentSearch)
-        return exclude_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
+        near = array_near(self.array, self.magnet)
+        return exclude_faulty_sensors(near, fixes, refit, readings, ambient, free_position=free)
 
     def _fit_with_all_sensors(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Return fixes of some rows with all sensors, by detection, search and uncertainty."""
@@ -202,8 +219,12 @@ class Locator:
                     f" {self._fewest} are needed",
                 )
             else:
-                found.fill(rows, search.optima)
+                found.fill(rows, search.optima if self.magnet is None else partial(self._magnets, search.optima))
         return found.fixes()
+
+    def _magnets(self, search: Callable[[WhitenedRows], list[Optima]], rows: WhitenedRows) -> list[Optima]:
+        assert self.magnet is not None
+        return [fit_magnet(optima, self.magnet, self._prior) for optima in search(rows)]
 
 
 class _FixCollector:
@@ -305,6 +326,7 @@ def locate(
     prior: SourcePrior = NOTHING_KNOWN,
     ambient_T: ArrayLike | None = None,
     body_length_m: float | None = None,
+    magnet: Shape | None = None,
     exclude_faulty: bool = True,
     average: bool = False,
     rng: Rng = 0,
@@ -328,6 +350,8 @@ def locate(
         Ambient field in the array's frame [T], in place of that of the readings or the array.
     body_length_m : float, optional
         Length of the object [m], 0 for a point; by default as for :class:`Locator`.
+    magnet : Shape, optional
+        Shape of the source, as for :class:`Locator`.
     exclude_faulty, average : bool
         Leave out sensors that contradict all others. Average all rows to one fix; array and source must stand still.
     rng : int or numpy.random.Generator
@@ -366,15 +390,16 @@ def locate(
     rows, array, saturated = used_rows(measured, array, average=average)
     ambient = rows.ambient_T
     pose = rows.pose
-    place = None if position_m is None else _places_in_array(position_m, pose)
+    place = None if position_m is None else places_in_array(position_m, pose)
     stated = with_stated_pose(array, rows).pose
     array = _with_eddies(array, rows)
     locator = Locator(
-        array if stated is None else _with_attitude_as_field_error(array, stated, rows, ambient),
+        array if stated is None else with_attitude_as_field_error(array, stated, rows, ambient),
         sources=sources,
         position_m=place,
         prior=prior,
         body_length_m=body_length_m,
+        magnet=magnet,
         exclude_faulty=exclude_faulty,
         rng=rng,
     )
@@ -389,18 +414,6 @@ def locate(
     return fixes.moved(*pose, frame="world", added_covariance=added)
 
 
-def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | None) -> FloatArray:
-    """Return known positions (n, K, 3) in the array's axes of every row; n is 1 at rest.
-
-    `position_m` (3,) or (K, 3) is in the frame of the results.
-    """
-    place = np.asarray(position_m, dtype=np.float64)
-    if place.shape != (3,) and (place.ndim != 2 or place.shape[1] != 3 or not len(place)):
-        raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
-    place = place.reshape(1, -1, 3)
-    return place if pose is None else np.einsum("nji,nkj->nki", pose[1].as_matrix(), place - pose[0][:, None])
-
-
 def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
     """Return the array with eddy currents as errors of its offsets.
 
@@ -410,20 +423,6 @@ def _with_eddies(array: SensorArray, rows: Readings) -> SensorArray:
         return array
     _, rate_rad_s = rates_of(rows.time_s, rows.pose[0], rows.pose[1].as_matrix())
     return with_eddies_as_offsets(array, ambient_in_array(array, rows.values_T, rows.ambient_T), rate_rad_s)
-
-
-def _with_attitude_as_field_error(
-    array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
-) -> SensorArray:
-    """Return the array with attitude errors as errors of the ambient field.
-
-    Errors are rms over the rows; they affect only moduli.
-    """
-    attitude_rad = pose.attitude_rad if rows.pose_sigma is None else np.sqrt(np.mean(rows.pose_sigma[:, 1] ** 2))
-    field_T = array.ambient_fields if ambient_T is None else ambient_T
-    size_T = float(np.sqrt(np.mean(np.sum(field_T**2, axis=-1))))
-    turned_T = float(np.hypot(attitude_rad, pose.attitude_constant_rad)) * size_T
-    return replace(array, ambient_uncertainty_T=float(np.hypot(array.ambient_uncertainty_T, turned_T)))
 
 
 def used_rows(

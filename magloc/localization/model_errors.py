@@ -18,6 +18,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.fields.multipole import NEAR, assumed_body_lengths, finite_body_errors
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
+from magloc.measurement.magnet import MagnetModel
 from magloc.measurement.whitened import WhitenedModel
 
 # Value of |s| of unit q = (u, s) below which the source is farther than NEAR from every sensor.
@@ -136,8 +137,10 @@ def _refine(optima: Optima, lengths: FloatArray, ambient_sigma_T: float, errors:
 def model_errors(
     model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray, ambient_sigma_T: float
 ) -> FloatArray:
-    """Return errors by bodies and by the ambient field, (b, C, n) in units of the noise."""
-    parts = [body_errors(model, q, mu, length_m)] if length_m.any() else []
+    """Return errors by bodies or rolls and by the ambient field, (b, C, n) in units of the noise."""
+    parts = [model.roll_errors(q, mu)] if isinstance(model, MagnetModel) else []
+    if length_m.any():
+        parts.append(body_errors(model, q, mu, length_m))
     if ambient_sigma_T:
         parts.append(ambient_errors(model, q, mu, ambient_sigma_T))
     return np.concatenate(parts, axis=-1)

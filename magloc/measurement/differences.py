@@ -20,6 +20,7 @@ from arrays.differences import Differences, decorrelated_differences
 from arrays.io.values import numbers
 from arrays.typing import FloatArray
 from magloc.fields import dipole
+from magloc.measurement.magnet import source_field, source_jacobian
 
 _NICE_SIGNAL = 300.0
 _NICE_RANGE = 3.0
@@ -45,9 +46,8 @@ def channel_jacobian(
 
     A modulus has the gradient of its field along the direction of the sum: equation (4) of the source paper.
     """
-    p = np.asarray(position_m, dtype=np.float64)[..., None, :]
-    m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
-    jacobian = dipole.field_jacobian(array.positions, p, m)
+    p, m = np.asarray(position_m, dtype=np.float64), np.asarray(moment_Am2, dtype=np.float64)
+    jacobian = source_jacobian(array, p, m)
     rows = array.channel_gain
     if array.channel_is_scalar.any():
         rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
@@ -58,9 +58,8 @@ def fields_at_sensors(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
 ) -> FloatArray:
     """Return the field at every sensor (..., N, 3) [T], the ambient field included."""
-    p = np.asarray(position_m, dtype=np.float64)[..., None, :]
-    m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
-    return dipole.field(array.positions, p, m) + (array.ambient_fields if ambient_T is None else ambient_T)
+    p, m = np.asarray(position_m, dtype=np.float64), np.asarray(moment_Am2, dtype=np.float64)
+    return source_field(array, p, m) + (array.ambient_fields if ambient_T is None else ambient_T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -367,3 +367,17 @@ def rates_of(time_s: FloatArray, position_m: FloatArray, R: FloatArray) -> tuple
     angle = np.arctan2(sine, 0.5 * (np.trace(turns, axis1=1, axis2=2) - 1.0))
     scale = np.divide(angle, sine, out=np.ones(n), where=sine > 0.0)[:, None]
     return velocity, np.divide(scale * skew, dt, out=np.zeros_like(skew), where=moving)
+
+
+def with_attitude_as_field_error(
+    array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
+) -> SensorArray:
+    """Return the array with attitude errors as errors of the ambient field.
+
+    Errors are rms over the rows; they affect only moduli.
+    """
+    attitude_rad = pose.attitude_rad if rows.pose_sigma is None else np.sqrt(np.mean(rows.pose_sigma[:, 1] ** 2))
+    field_T = array.ambient_fields if ambient_T is None else ambient_T
+    size_T = float(np.sqrt(np.mean(np.sum(field_T**2, axis=-1))))
+    turned_T = float(np.hypot(attitude_rad, pose.attitude_constant_rad)) * size_T
+    return replace(array, ambient_uncertainty_T=float(np.hypot(array.ambient_uncertainty_T, turned_T)))

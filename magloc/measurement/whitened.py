@@ -167,6 +167,11 @@ class WhitenedModel(ScaledSensors):
         )
 
     @property
+    def has_kernels(self) -> bool:
+        """True if the sources are dipoles, which kernels fit."""
+        return True
+
+    @property
     def is_even(self) -> bool:
         """True if moments m and -m give the same readings, as for moduli alone without an ambient field."""
         return bool(self.channel_is_scalar.all()) and not np.any(self.ambient)
@@ -276,8 +281,8 @@ class WhitenedModel(ScaledSensors):
             gain[:, scalar] = self.gain[:, scalar, :1] * np.where(modulus > 0.0, total / modulus, 0.0)
         return gain
 
-    def moment_jacobian(self, q: FloatArray, gain: FloatArray) -> FloatArray:
-        """Return the derivative (b, C, 3 K) of the predictions by μ."""
+    def moment_jacobian(self, q: FloatArray, gain: FloatArray, mu: FloatArray | None = None) -> FloatArray:
+        """Return the derivative (b, C, 3 K) of the predictions by μ, on which it does not depend for dipoles."""
         n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
         along = np.sum(n * gain[:, None], axis=-1, keepdims=True)
         columns = (3.0 * along * n - gain[:, None]) * inverse3

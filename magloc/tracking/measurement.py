@@ -25,6 +25,7 @@ from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.magnet import source_field
 from magloc.measurement.nuisances import BackgroundDrift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import N_POSE, ArrayPose, PoseErrors
 from magloc.state_space import MeasurementFunction
@@ -177,7 +178,7 @@ class RowMeasurement:
     def field_T(self, source: FloatArray) -> FloatArray:
         """Return the field (N, 3) of a source (6,) at the sensors, in the array's axes."""
         in_array = self.pose.to_array(source)
-        return dipole.field(self.model.array.positions, in_array[:3], in_array[3:])
+        return source_field(self.model.array, in_array[:3], in_array[3:])
 
     def predict(self, state: FloatArray) -> FloatArray:
         """Return the predicted differences (k,) of a state (n,), with its errors of sensors."""
@@ -392,7 +393,7 @@ class Coordinates:
 
 def _readings_of(array: SensorArray, readings_T: FloatArray, source: FloatArray) -> FloatArray:
     """Return readings (C,) of a source in the array's frame and of the common field that measured ones (C,) leave."""
-    fields_T = dipole.field(array.positions, source[:3], source[3:]) + array.ambient_fields
+    fields_T = source_field(array, source[:3], source[3:]) + array.ambient_fields
     if array.ambient_T is None:
         fields_T = fields_T + mean_of_finite(array.calibrated_field(readings_T) - fields_T, axis=-2)
     return array.readings_of(fields_T)

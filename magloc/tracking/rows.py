@@ -14,6 +14,7 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc import core
 from magloc.ambient import in_world_field
+from magloc.measurement.magnet import magnet_of
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings, without_saturated
 
@@ -140,6 +141,8 @@ class Rows:
     def problem(self) -> core.Problem:
         """Arguments of kernels."""
         array, order = self.array, np.arange(len(self.readings))
+        magnet = magnet_of(array)
+        shape, size = (-1, (0.0, 0.0, 0.0)) if magnet is None else magnet.kernel_size
         return core.problem(
             "rows",
             n_sensors=array.n_sensors,
@@ -165,6 +168,8 @@ class Rows:
             ambient_of_row=order if len(self.ambients_T) > 1 else np.zeros_like(order),
             pose_effects=None if self.pose_effects is None else np.ascontiguousarray(self.pose_effects),
             lever_arm=self.lever_arm_m,
+            shape=shape,
+            size=size,
         )
 
 

@@ -18,6 +18,7 @@ from arrays.io.csv import Column
 from arrays.io.lazy import by_name
 from arrays.io.results import Result
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
+from magloc.fields.shapes import Shape
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.measurement.nuisances import BackgroundDrift
@@ -276,6 +277,7 @@ def track(
     motion: MotionModel | None = None,
     smooth: bool = False,
     prior: SourcePrior = NOTHING_KNOWN,
+    magnet: Shape | None = None,
     progress: Callable[[int], None] | None = None,
     told: Callable[[TrackPoint], object] | None = None,
 ) -> Track:
@@ -298,6 +300,8 @@ def track(
         Use later rows too (fixed-interval smoother).
     prior : SourcePrior
         Bounds of the source where a track starts, and its known moment, in the array's frame.
+    magnet : Shape, optional
+        Shape of the source, as for :class:`Tracker`.
     progress : callable, optional
         Called with the number of rows finished since the last call.
     told : callable, optional
@@ -327,7 +331,9 @@ def track(
         lasting = (smooth or used.background) and used.motion is None
         motion = (OrnsteinUhlenbeck if lasting else RandomWalk)(SPEED_M_S, TURN_RAD_S)
     background = BackgroundDrift.of(used.background, used.time_s)
-    tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth, background=background)
+    tracker = Tracker(
+        with_stated_pose(array, used), motion, prior=prior, magnet=magnet, keep_steps=smooth, background=background
+    )
     if background is not None:
         if used.motion is not None:
             raise ValueError("Input readings must have measured velocities and rates or a background, not both.")

@@ -23,7 +23,9 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
+from magloc.fields.shapes import Shape
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.measurement.magnet import array_near, check_without_roll
 from magloc.measurement.nuisances import BackgroundDrift
 from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, AcquiredSource, Acquisition, CartesianFilter
@@ -65,6 +67,8 @@ class Tracker(CartesianFilter):
         Motion of the source, such as :class:`magloc.RandomWalk`.
     prior : SourcePrior
         Bounds of the source where a track starts, and its known moment, in the array's frame.
+    magnet : Shape, optional
+        Shape of the source, a magnet that is magnetised along its axis: a cylinder, ring or sphere.
     keep_steps : bool
         Whether to collect the steps for a smoother in `steps`.
     background : Drift, optional
@@ -97,9 +101,12 @@ class Tracker(CartesianFilter):
         motion: MotionModel,
         *,
         prior: SourcePrior = NOTHING_KNOWN,
+        magnet: Shape | None = None,
         keep_steps: bool = False,
         background: BackgroundDrift | None = None,
     ) -> None:
+        array = array_near(array, magnet)
+        check_without_roll(array)
         self.array, self.prior, self.background, self.keep_steps = array, prior, background, keep_steps
         self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors

@@ -9,10 +9,11 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from arrays.array import SensorArray
-from arrays.geometries import tetrahedron
+from arrays.geometries import grid, tetrahedron
 from arrays.sensor import Sensor
 from magloc import core
 from magloc.directions import fibonacci_directions
+from magloc.fields.shapes import Shape, aligned_fields
 from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.localization.uncertainty.covariance import solutions_of
@@ -73,7 +74,27 @@ def rows(size: Size) -> Iterator[Row]:
                 f"optimum found: ours {ours}, peer {success(chi2_found[n_starts])}" if what == "many" else "",
             )
     yield Row(f"a fix, {size.rows:,} at once, {threads} thr.", timings["all threads"])
+    yield from magnets(size)
     yield from growth(size)
+
+
+def magnets(size: Size) -> Iterator[Row]:
+    """Magnets of known shape one to three lengths over twelve sensors, beside dipoles fitted to the same readings."""
+    rng, array = np.random.default_rng(6), grid(4, 3, 0.01, noise_T=1e-6)
+    position = array.centroid + rng.uniform([-0.015, -0.01, 0.015], [0.015, 0.01, 0.03], (size.rows, 3))
+    moment = rng.normal(size=(size.rows, 3))
+    for magnet in (Shape("cylinder", (0.01, 0.005)), Shape("cuboid", (0.01, 0.01, 0.005))):
+        field = aligned_fields(magnet, array.positions, position[:, None], moment[:, None], 0.3)[0]
+        readings = field.reshape(size.rows, -1) + 1e-6 * rng.normal(size=(size.rows, array.n_channels))
+        ours, dipoles = plain_locator(array, magnet=magnet), plain_locator(array, body_length_m=0.0)
+        contestants = {
+            "magnet": Contestant(lambda locator=ours, z=readings: locator.fit_rows(z), 1, size.rows),
+            "dipole": Contestant(lambda locator=dipoles, z=readings: locator.fit_rows(z), 1, size.rows),
+        }
+        timings = interleaved(contestants, size.rounds)
+        yield Row(
+            f"a {magnet.kind} near, {size.rows:,} at once, 1 thr.", timings["magnet"], "a dipole", timings["dipole"]
+        )
 
 
 def growth(size: Size) -> Iterator[Row]:

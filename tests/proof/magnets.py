@@ -25,6 +25,7 @@ MOCAP_SIGMA_M = 0.15e-3
 RUNS = (1, 2, 3)
 SUBTRACTED = 'background = "subtracted"\n'
 NOISY = "noise_nT = 2000, noise_fraction = 0.03"
+CYLINDER = ("--magnet", "cylinder", "--size-m", "0.01", "0.01")
 FOUR = ("s08", "s11", "s20", "s23")
 EVERY = 10
 """Rows of the robot's recording that scipy takes: each tenth; it takes as long as all the others together."""
@@ -76,13 +77,15 @@ def our_mocap(data: Path, _: Size) -> Iterator[Row]:
             noisy = Path(name) / "noisy.toml"
             text = array.read_text(encoding="utf-8")
             noisy.write_text(text.replace("noise_fraction = 0.003", "noise_fraction = 0.01"), encoding="utf-8")
-            for label, path, needs in (
-                ("locate", array, "array file"),
-                ("track", array, "array file"),
-                ("track", noisy, "array file with noise_fraction = 0.01"),
+            for label, path, needs, shape in (
+                ("locate", array, "array file", ()),
+                ("locate", array, "array file, size and shape of the magnet", CYLINDER),
+                ("track", array, "array file", ()),
+                ("track", noisy, "array file with noise_fraction = 0.01", ()),
+                ("track", noisy, "array file with noise_fraction = 0.01, size and shape of the magnet", CYLINDER),
             ):
-                text, seconds = run_command("magloc", label, readings, "--array", path, "--json")
-                tool = f"`magloc {label}`" + (", noise stated" if path == noisy else "")
+                text, seconds = run_command("magloc", label, readings, "--array", path, *shape, "--json")
+                tool = f"`magloc {' '.join([label, *shape[:2]])}`" + (", noise stated" if path == noisy else "")
                 yield _mocap_row(run, tool, needs, seconds / len(truth.time_s), *best_solutions(text), truth)
         out = Path(name) / "calibrated.toml"
         run3 = folder / "run3.csv", "--array", folder / "array-nominal.toml", "--truth", folder / "run3-truth.csv"

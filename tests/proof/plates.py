@@ -22,6 +22,7 @@ from tests.proof import Part, Row, Size, row_of_errors, row_of_offsets, run_comm
 from tests.proof.dipole_peers import dipole_jacobian
 
 AVERAGED_ROWS = 100
+CYLINDER = ("--magnet", "cylinder", "--size-m", "0.00075", "0.001")
 MOST_STARTS = 4
 """Starts of all 24 magnets at once, which take many seconds each."""
 WRONG_WELL_M = 5e-3
@@ -87,15 +88,15 @@ def our_plate(data: Path, _: Size) -> Iterator[Row]:
         numbers = ",".join(f"{1e9 * value:.1f}" for value in values)
         readings.write_text(f"time_s,{','.join(columns)}\n0,{numbers}\n", encoding="utf-8")
         write_array(path, array)
-        text, seconds = run_command(
-            "magloc", "locate", readings, "--array", path, "--sources", str(len(WELL)), "--json"
-        )
-    (entry,) = json.loads(text)["results"]
-    found = np.array([source["position_m"] for source in entry["solutions"][0]["sources"]])
-    needs = "array file, number of magnets"
-    yield row_of_offsets(
-        "mean of 100 rows", "`magloc locate --sources 24`", needs, seconds, _off_wells(found), WRONG_WELL_M
-    )
+        for shape, needs in ((), ""), (CYLINDER, ", their size and shape"):
+            text, seconds = run_command(
+                "magloc", "locate", readings, "--array", path, "--sources", str(len(WELL)), *shape, "--json"
+            )
+            (entry,) = json.loads(text)["results"]
+            found = np.array([source["position_m"] for source in entry["solutions"][0]["sources"]])
+            tool = f"`magloc {' '.join(['locate --sources 24', *shape[:2]])}`"
+            needs = f"array file, number of magnets{needs}"
+            yield row_of_offsets("mean of 100 rows", tool, needs, seconds, _off_wells(found), WRONG_WELL_M)
 
 
 def scipy_plate(data: Path, size: Size) -> Iterator[Row]:

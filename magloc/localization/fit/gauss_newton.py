@@ -143,7 +143,7 @@ def _jacobian(
 ) -> FloatArray:
     """Return the Jacobian of predictions and known moments by μ, or along tangents of q."""
     if tangent is None:
-        of_readings = problem.moment_jacobian(q, gain)
+        of_readings = problem.moment_jacobian(q, gain, mu)
     else:
         of_readings = problem.position_jacobian(q, mu, gain, tangent)
     if problem.known is None:
@@ -237,7 +237,7 @@ def _has_kernel(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
 
     They refine sources with unknown moments by vector sensors, and one source of free direction by any sensors.
     """
-    if problem.known is not None or not free.any() or len(free) > MOST_SOURCES:
+    if not problem.has_kernels or problem.known is not None or not free.any() or len(free) > MOST_SOURCES:
         return False
     return not problem.sees_moduli or (len(free) == 1 and bool(free[0, :2].all()))
 

@@ -7,6 +7,8 @@ linear in the moment, and the solution is unique, equations (20) to (30).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -19,6 +21,9 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.measurement.rows import WhitenedRows
 from magloc.measurement.whitened import WhitenedModel
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 N_UNKNOWNS = 3
 _N_DIRECTIONS = 60
@@ -138,3 +143,15 @@ def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
     silent = ~np.any(problem.gain, axis=-1)
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
     return np.all(silent | lone, axis=-1)
+
+
+def places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | None) -> FloatArray:
+    """Return known positions (n, K, 3) in the array's axes of every row; n is 1 at rest.
+
+    `position_m` (3,) or (K, 3) is in the frame of the results.
+    """
+    place = np.asarray(position_m, dtype=np.float64)
+    if place.shape != (3,) and (place.ndim != 2 or place.shape[1] != 3 or not len(place)):
+        raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
+    place = place.reshape(1, -1, 3)
+    return place if pose is None else np.einsum("nji,nkj->nki", pose[1].as_matrix(), place - pose[0][:, None])

@@ -36,6 +36,7 @@ from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_
 from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
+NOT_ALLOWED = "no solution lies within the known region and largest moment"
 _MORE = 3  # factor on the number of starts if none of them explains a row
 # Largest share of missing channels for which candidates are ranked by the bases of all channels.
 _MOST_MISSING = 0.4
@@ -251,5 +252,5 @@ def cached_search(array: SensorArray) -> SingleSourceSearch:
 
 def _why_unsolved(n_optima: int) -> str:
     if n_optima:
-        return "no solution lies within the known region and largest moment"
+        return NOT_ALLOWED
     return "the search did not converge from any of its starts"

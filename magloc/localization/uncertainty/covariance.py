@@ -64,7 +64,7 @@ def solutions_of(optima: Optima, detected: BoolArray) -> Solutions:
     n_fits, n_sources = fits.q.shape[:2]
     if optima.position_m is not None:
         known = _known_position_columns(optima, optima.position_m)
-    elif n_sources > 1 or model.sees_moduli or model.known is not None:
+    elif n_sources > 1 or model.sees_moduli or model.known is not None or not model.has_kernels:
         known = fit_columns(optima, detected)
     else:
         known = single_source_columns(optima)

@@ -16,6 +16,8 @@ from magloc.localization.uncertainty.range_interval import ranges_of, relative_r
 from magloc.measurement.whitened import WhitenedModel
 
 _SMALLEST_ALPHA = 1e-6
+# Half width of a stretch below which the profile is a parabola; without kernels its points take long.
+_NARROW_RAD = 0.01
 # Steps outwards, relative to the step at which a Gaussian profile would reach the limit.
 _STEPS = np.array([1.0, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
@@ -42,7 +44,15 @@ def profile_stretches(
     q = fits.q[:, source]
     alpha = np.arctan2(np.abs(q[:, 3]), np.linalg.norm(q[:, :3], axis=-1))
     sigma = np.abs(np.nan_to_num(sigma_over_range, nan=1.0)) * np.sin(alpha) * np.cos(alpha)
-    step = np.clip(np.sqrt(rise) * sigma, 1e-7, 0.05)
+    reach = np.sqrt(rise) * sigma
+    if not problem.has_kernels and (narrow := reach < _NARROW_RAD).any():
+        ends = np.stack([alpha - reach, alpha + reach], axis=1)
+        wide = np.flatnonzero(~narrow)
+        of_wide = problem.rows(wide), y[wide], fits.rows(wide), source, sigma_over_range[wide], rise[wide]
+        if wide.size:
+            ends[wide] = profile_stretches(*of_wide)
+        return ends
+    step = np.clip(reach, 1e-7, 0.05)
     # Both sides at once: first outwards (decreasing α) for all fits, then inwards.
     rows = np.tile(np.arange(n), 2)
     sign = np.repeat([-1.0, 1.0], n)

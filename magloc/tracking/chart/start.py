@@ -25,6 +25,7 @@ from magloc.directions import sphere_directions
 from magloc.levels import CONTRADICTION, CREDIBLE_ROW
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import Locator
+from magloc.measurement.magnet import magnet_of
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking import row_filter
@@ -147,8 +148,10 @@ class TrackStarter:
         self._locator: Locator | None = None
         self._examiner: Locator | None = None
         if decorrelated_differences(array).n_differences >= N_SOURCE:
-            self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
-            self._examiner = Locator(array, prior=prior)
+            magnet = magnet_of(array)
+            length_m = 0.0 if magnet is None else None
+            self._locator = Locator(array, prior=prior, body_length_m=length_m, magnet=magnet, exclude_faulty=False)
+            self._examiner = Locator(array, prior=prior, magnet=magnet)
 
     def mixture(self, measurement: RowOrStack, motion: MotionModel) -> tuple[Mixture | None, str]:
         """Return the mixture of source and errors of the pose by one row, or None and the reason."""

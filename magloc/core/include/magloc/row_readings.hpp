@@ -3,6 +3,7 @@
 #pragma once
 #include "dipole.hpp"
 #include "elementary.hpp"
+#include "magnets.hpp"
 #include "padded.hpp"
 
 MAGLOC_BEGIN
@@ -25,7 +26,8 @@ class RowReadings {
   double true_rotation_[9], turn_of_change_[3][3], by_field_[3][3];  // where the pose has errors
   int64_t *const first_ = space_.take<int64_t>(n_), *const end_ = space_.take<int64_t>(n_);
   bool has_modulus_ = false, is_sparse_ = false;
-  int64_t row_ = -1;  // whose readings are loaded
+  const Body<T> body_{maximum(p_.shape, (int64_t)0), p_.size};  // of all sources, unless they are dipoles
+  int64_t row_ = -1;                                            // whose readings are loaded
 
  public:
   Padded<T> effect{space_, p_.n_nuisances, k_};  // of nuisances on the readings
@@ -157,6 +159,10 @@ class RowReadings {
       if (has_modulus_) fill_gain_of_modulus(r, gain);
       T value = dot(gain, ambient);
       for (int64_t k = 0; k < n_sources_; ++k) {
+        if (p_.shape >= 0) {
+          value += add_magnet<with_slopes>(r, k, gain);
+          continue;
+        }
         const double (&m)[3] = *reinterpret_cast<const double (*)[3]>(sources_ + 6 * k + 3);
         const Ray<T> ray = ray_to(r, k);
         T by_moment[3];
@@ -265,13 +271,40 @@ class RowReadings {
     for (int i = 0; i < 3; ++i) d[i] = place_.lanes(i)[r] - sources_[6 * k + i];
     return Ray<T>::from(d);
   }
+  // Field of a source that is a magnet of known shape.
+  AlignedField<T> magnet_field(int64_t r, int64_t k) const {
+    T d[3], m[3];
+    for (int i = 0; i < 3; ++i) {
+      d[i] = place_.lanes(i)[r] - sources_[6 * k + i];
+      m[i] = broadcast<T>(sources_[6 * k + 3 + i]);
+    }
+    return {body_, d, m};
+  }
+  // Return what a magnet adds to the channels' values, and fill their slopes if wanted.
+  template <bool with_slopes>
+  T add_magnet(int64_t r, int64_t k, const T (&gain)[3]) {
+    const AlignedField<T> b = magnet_field(r, k);
+    for (int i = 0; with_slopes && i < 3; ++i) {
+      T by_position{}, by_moment{};
+      for (int j = 0; j < 3; ++j)
+        by_position += gain[j] * b.by_position[j][i], by_moment += gain[j] * b.by_moment[j][i];
+      channels_.lanes(1 + 6 * k + i)[r] = by_position;
+      channels_.lanes(4 + 6 * k + i)[r] = by_moment;
+    }
+    return dot(gain, b.field);
+  }
   // A modulus reads the field along itself.
   void fill_gain_of_modulus(int64_t r, T (&gain)[3]) const {
     T b[3], of_source[3];
     for (int i = 0; i < 3; ++i) b[i] = ambient_.lanes(i)[r];
     for (int64_t k = 0; k < n_sources_; ++k) {
-      field(ray_to(r, k), *reinterpret_cast<const double (*)[3]>(sources_ + 6 * k + 3), of_source);
-      for (int i = 0; i < 3; ++i) b[i] += of_source[i];
+      if (p_.shape < 0) {
+        field(ray_to(r, k), *reinterpret_cast<const double (*)[3]>(sources_ + 6 * k + 3), of_source);
+        for (int i = 0; i < 3; ++i) b[i] += of_source[i];
+      } else {
+        const AlignedField<T> of_magnet = magnet_field(r, k);
+        for (int i = 0; i < 3; ++i) b[i] += of_magnet.field[i];
+      }
     }
     const T modulus = square_root(dot(b, b)), scale = choose(modulus > 0.0, gain[0] / modulus, T{});
     for (int i = 0; i < 3; ++i) gain[i] = choose(modulus_.lanes(0)[r] > 0.0, scale * b[i], gain[i]);
