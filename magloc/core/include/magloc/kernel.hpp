@@ -24,6 +24,8 @@
   X(mekf_runs, mekf)                          \
   X(filter_starts, starts)                    \
   X(refine, refinement)                       \
+  X(refine_poses, pose_refinement)            \
+  X(search_poses, pose_search)                \
   X(candidate_bases, candidate_positions)     \
   X(choose_candidates, candidate_choice)      \
   X(search_optima, search)                    \
