@@ -40,6 +40,19 @@ typedef struct {
 int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Field of a uniformly magnetised body and its derivatives at points outside it, in the body's frame; an item is a
+   point. Inside the body and on its surface everything is NaN. */
+typedef struct {
+  int64_t n_points, shape; /* 0: cuboid, 1: cylinder or ring about z, 2: sphere */
+  double size[3];          /* halves of the edges; inner radius, outer radius, half height; radius, 0, 0 */
+  const double *points;    /* (n_points, 3): from the body's centre */
+  const double *moments;   /* (n_points, 3) */
+  double *fields;          /* (n_points, 3) */
+  double *matrices;        /* (n_points, 3, 3): the fields by the moment */
+  double *gradients;       /* (n_points, 3, 3): the fields by the point */
+} magloc_magnets;
+int64_t magloc_shape_fields(const magloc_magnets *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Attitudes of a camera that triangles of its image's stars state by those of a catalogue. An item is a triangle of the
    image; calls are in order, and compute nothing more once the best attitudes match enough stars or enough attitudes
    were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius,

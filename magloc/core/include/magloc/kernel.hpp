@@ -7,6 +7,7 @@
 #define MAGLOC_KERNELS(X)                     \
   X(dipole_fields, dipoles)                   \
   X(dipole_gradients, dipoles)                \
+  X(shape_fields, magnets)                    \
   X(star_search, star_triangles)              \
   X(complementary_filter, complementary)      \
   X(adaptive_filter, adaptive)                \
