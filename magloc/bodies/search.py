@@ -178,7 +178,7 @@ def refine_dipoles(
     pose, chi2, covariance = np.empty((n, 12)), np.empty(n), np.empty((n, 6, 6))
     iterations, converged = np.empty(n, np.int64), np.empty(n, np.uint8)
     start = packed(model, position_m, R)
-    results = {"start": start, "pose": pose, "chi2": chi2, "covariance": covariance}
+    results: dict[str, object] = {"start": start, "pose": pose, "chi2": chi2, "covariance": covariance}
     results |= {"iterations": iterations, "converged": converged}
     work = _fit_problem(model, y, body, np.arange(n), max_iterations, **results)
     core.run("refine_poses", work, n, block=_ROWS_A_BLOCK)
