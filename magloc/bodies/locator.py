@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -72,6 +73,7 @@ class BodyLocator:
         if self.array.common_field_T is None:
             check_spans(self.array)
         check_magnitudes(self.array)
+        object.__setattr__(self, "array", _with_offsets_as_noise(self.array))
         object.__setattr__(self, "symmetry", body_symmetry(self.body))
         object.__setattr__(self, "_dipoles", self.body.as_dipoles() if self.body.has_shapes else self.body)
 
@@ -305,6 +307,15 @@ class BodyLocator:
                 reason=[""] * chosen.size,
             ),
         )
+
+
+def _with_offsets_as_noise(array: SensorArray) -> SensorArray:
+    """Return the array with errors of the offsets as noise of a single row."""
+    sensors = tuple(
+        replace(sensor, noise_T=math.hypot(sensor.noise_T, sensor.offset_uncertainty_T), offset_uncertainty_T=0.0)
+        for sensor in array.sensors
+    )
+    return replace(array, sensors=sensors)
 
 
 def _without(body: MagnetBody, index: int) -> MagnetBody:
