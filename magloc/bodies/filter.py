@@ -60,6 +60,11 @@ class BodyTracker:
         self._state: _State | None = None
         self._lasting: tuple[FloatArray, FloatArray] | None = None  # of the errors: mean, covariance
 
+    def restart(self) -> None:
+        """Begin a new track at the next row, whose time may be earlier; what is known of lasting errors stays."""
+        self._keep_errors()
+        self._state = self._last_s = None
+
     def follow(self, readings_T: ArrayLike, time_s: FloatArray, ambient_T: FloatArray | None = None) -> BodyTrack:
         """Return the track over rows of raw readings (n, C) [T] at times (n,), which come after all rows before."""
         values = check_rows(self.array, readings_T)

@@ -73,7 +73,7 @@ class BodyLocator:
         if self.array.common_field_T is None:
             check_spans(self.array)
         check_magnitudes(self.array)
-        object.__setattr__(self, "array", _with_offsets_as_noise(self.array))
+        object.__setattr__(self, "array", with_offsets_as_noise(self.array))
         object.__setattr__(self, "symmetry", body_symmetry(self.body))
         object.__setattr__(self, "_dipoles", self.body.as_dipoles() if self.body.has_shapes else self.body)
 
@@ -309,7 +309,7 @@ class BodyLocator:
         )
 
 
-def _with_offsets_as_noise(array: SensorArray) -> SensorArray:
+def with_offsets_as_noise(array: SensorArray) -> SensorArray:
     """Return the array with errors of the offsets as noise of a single row."""
     sensors = tuple(
         replace(sensor, noise_T=math.hypot(sensor.noise_T, sensor.offset_uncertainty_T), offset_uncertainty_T=0.0)

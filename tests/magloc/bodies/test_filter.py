@@ -77,9 +77,8 @@ def test_the_compiled_filter_is_the_readable_one(shaped: bool, monkeypatch: pyte
     assert readable.status == compiled.status
     sigma = np.sqrt(np.diagonal(compiled.covariance[:, 0], axis1=1, axis2=2))
     assert (np.abs(readable.position_m - compiled.position_m)[:, 0] < 0.02 * sigma[:, :3]).all()
-    np.testing.assert_allclose(
-        readable.covariance, compiled.covariance, rtol=0.02, atol=1e-3 * np.max(sigma[:, :3]) ** 2
-    )
+    unit = 1.0 / (sigma[:, None, :, None] * sigma[:, None, None, :])
+    np.testing.assert_allclose(unit * readable.covariance, unit * compiled.covariance, atol=0.02)
 
 
 def test_errors_of_magnets_and_sensors_are_estimated() -> None:
