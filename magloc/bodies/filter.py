@@ -104,7 +104,7 @@ class BodyTracker:
         self._state = None
         ambient = None if ambient_T is None else ambient_T[row : row + 1]
         found = self.locator.fit_rows(values[row : row + 1], ambient)
-        if not found.solved[0] or found.flags[0]:
+        if not found.solved[0] or set(found.flags[0]) - {"bent"}:
             track.status[row] = f"not acquired: {found.reason[0] or ', '.join(found.flags[0])}"
             track.flags[row], track.reason[row] = found.flags[0], track.status[row]
             return False
