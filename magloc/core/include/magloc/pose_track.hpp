@@ -121,7 +121,7 @@ class BodyFilter {
       F_[(n_ + 1) * (pose + q_ + e)] = lasting[e];
       p_.errors[q_ + e] *= lasting[e];
     }
-    multiply_by_F();
+    propagate();
     for (int i = 0; i < 3; ++i) {
       add_noise(i, d_ + i, of_x + 2);
       add_noise(3 + i, d_ + 3 + i, of_turn + 2);
@@ -134,8 +134,8 @@ class BodyFilter {
     P_[rate][i] = P_[i][rate];
     P_[rate][rate] += root[1] * root[1] + root[2] * root[2];
   }
-  // P becomes F P F^T; rows of F have few numbers.
-  void multiply_by_F() {
+  // P becomes F P F^T; rows of F have few numbers that are not zero.
+  void propagate() {
     for (int64_t i = 0; i < n_; ++i) {
       for (int64_t j = 0; j < n_; ++j) moved_[i][j] = 0.0;
       for (int64_t k = 0; k < n_; ++k) {
