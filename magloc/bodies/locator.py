@@ -44,7 +44,7 @@ _LIMIT_SIGMAS = 3.0
 _OPEN_SIGMA_RAD = np.pi / np.sqrt(3.0)  # of an angle that may be anything
 _ABSENT = 1e-9
 _LARGEST_BEND = 0.3  # beyond it the mean NEES of simulated rows is 2
-_ROUNDS = 5
+_ROUNDS, _UNSETTLED = 5, 3.0
 _NO_POSE = "no start leads to a pose that fits"
 
 
@@ -203,7 +203,11 @@ class BodyLocator:
                 covariance = inverses(jacobian)
             else:
                 fits, covariance = refine_dipoles(refined.model, refined.y, self.body, position, R)
+            turn = Rotation.from_matrix(R.mT @ fits.R).as_rotvec()
+            moved = np.concatenate([fits.position_m - position, turn], axis=1)
             position, R = fits.position_m, fits.R
+        if self._has_errors:  # what the last round still changed is not known better than that
+            covariance = covariance + _UNSETTLED**2 * moved[:, :, None] * moved[:, None]
         settled.position_m[row, place], settled.R[row, place] = position, R
         settled.covariance[row, place] = covariance
         settled.chi2[row, place] = np.where(fits.converged, fits.chi2, np.nan)

@@ -65,6 +65,19 @@ def test_stated_errors_of_magnets_widen_the_covariance(stated: dict[str, float])
     assert np.nanmean(squares) == pytest.approx(1.0, abs=0.25)
 
 
+def test_large_errors_of_moments_are_consistent_or_flagged() -> None:
+    rng = np.random.default_rng(60_18)
+    array, body = hall_ring(4), knob(moment_sigma_Am2=0.005)
+    position_m, R = random_poses(body, 200, rng)
+    readings = [
+        readings_of(array, drawn(body, rng), x[None], turn[None], rng)[0] for x, turn in zip(position_m, R, strict=True)
+    ]
+    poses = locate_body(array, body, np.array(readings))
+    plain = np.array([not flags for flags in poses.flags]) & (poses.n_poses == 1)
+    assert plain.mean() > 0.3
+    assert nees(poses, position_m, R)[plain].mean() < 3.0
+
+
 def test_a_temperature_that_is_stated_does_not_bias() -> None:
     rng = np.random.default_rng(60_12)
     array = hall_ring(4)
