@@ -51,6 +51,8 @@ class FixOptions:
         Use all sensors, even those that contradict the others.
     magnet : MagnetOptions
         Shape of a magnet.
+    body : Path
+        Body file (TOML) of a rigid body of two or more magnets; its pose is estimated, in the array's frame.
     """
 
     sources: str | None = None
@@ -60,6 +62,7 @@ class FixOptions:
     body_length_m: float | None = None
     keep_sensors: Flag = False
     magnet: MagnetOptions = field(default_factory=MagnetOptions)
+    body: Path | None = None
 
     @property
     def n_sources(self) -> int | Literal["auto"]:
@@ -117,6 +120,15 @@ def locate(
 
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
     length_m, position = wanted.body_length_m, wanted.position
+    if wanted.body is not None:
+        from magloc.cli.moments.body_poses import locate_with_body, refuse_with_body
+
+        single = {"--sources": wanted.sources, "--position": position, "--body-length-m": length_m, "--truth": truth}
+        single |= {"--magnet": wanted.magnet.kind}
+        refuse_with_body(single | {"--average": wanted.average, "--ambient-gradient": wanted.ambient_gradient})
+        refuse_file(out, "--out")
+        locate_with_body(readings, array, wanted.body, known, as_json=json, out=out)
+        return
     joint = wanted.sources is not None or (position is not None and len(position) > 1)
     magnet = wanted.magnet.shape(position=position, body_length_m=length_m)
     refuse_outside(0.0, LARGEST, "a length, or 0 for a point", body_length_m=length_m)

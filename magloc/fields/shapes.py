@@ -90,6 +90,17 @@ class Shape:
             )
 
     @cached_property
+    def volume_m3(self) -> float:
+        """Volume [m³]."""
+        size = self.size_m
+        if self.kind == "cuboid":
+            return math.prod(size)
+        if self.kind == "sphere":
+            return math.pi / 6.0 * size[0] ** 3
+        inner = size[0] if self.kind == "ring" else 0.0
+        return math.pi / 4.0 * (size[-2] ** 2 - inner**2) * size[-1]
+
+    @cached_property
     def kernel_size(self) -> tuple[int, tuple[float, float, float]]:
         """Number of the shape, and its size, for kernels."""
         half = [0.5 * size for size in self.size_m]
