@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from arrays.io.csv import Column
-from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, POSITION
 from magloc.calibration.results import SourceCalibration, TurningCalibration
+from magloc.calibration.sensors import AXES, AXIS_PAIRS, GAINS, OFFSET, POSITION
 from magloc.plots import style
 
 if TYPE_CHECKING:

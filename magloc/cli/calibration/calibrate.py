@@ -287,7 +287,7 @@ def _compare_with_fixes(array: SensorArray, rows: Readings, path: Truth | None) 
 
 def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]:
     """Return the report that ``--json`` prints."""
-    from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
+    from magloc.calibration.sensors import AXES, GAINS, OFFSET, POSITION
 
     sensors = [
         {
@@ -324,7 +324,7 @@ def _table(result: SourceCalibration) -> list[str]:
     """Return the changes of every sensor, with the largest standard deviation of each group."""
     import numpy as np
 
-    from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
+    from magloc.calibration.sensors import AXES, GAINS, OFFSET, POSITION
     from magloc.cli.calibration import by_turning as turning
 
     rows = [["sensor", "position mm", "s", "gain %", "s", "axes °", "s", "offset µT", "s", "rms nT", ""]]
@@ -356,7 +356,7 @@ def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> l
     """Return notes on rows and χ², on undetermined directions, and on sensors with absurd gains."""
     import numpy as np
 
-    from magloc.calibration.model import GAINS
+    from magloc.calibration.sensors import GAINS
 
     notes = [
         f"{int(result.rows.sum())} of {n_rows} rows used; χ² {result.chi2_before:.4g} with {result.dof_before:.0f} "
