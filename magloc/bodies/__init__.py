@@ -1,0 +1,1 @@
+"""Rigid bodies of several magnets: their files, fields, poses and tracks."""
