@@ -12,14 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from arrays.sensor import _finite, _not_negative
 from arrays.typing import FloatArray, Vector
+from magloc.fields.shapes import Shape
 
-SHAPES = {
-    "cuboid": ("three edges", 3),
-    "cylinder": ("diameter and height", 2),
-    "ring": ("inner diameter, outer diameter and height", 3),
-    "sphere": ("diameter", 1),
-}
-"""Sizes of the shapes of magnets, in words and as a number of values."""
 LARGEST_REMANENCE_T = 2.0
 """Remanence beyond that of all magnets [T]; the best of NdFeB have 1.5 T."""
 NDFEB_PER_K = -1.1e-3
@@ -46,11 +40,8 @@ class Magnet:
         Standard deviation of the position, per axis [m].
     direction_sigma_rad : float
         Standard deviation of the moment's direction, about each of two axes across it [rad].
-    shape : str
-        "cuboid", "cylinder", "ring" or "sphere", uniformly magnetised; empty for a dipole.
-    size_m : tuple
-        Cuboid: three edges; cylinder: diameter, height; ring: inner diameter, outer diameter, height; sphere:
-        diameter [m].
+    shape : Shape, optional
+        Shape of a uniformly magnetised magnet; None for a dipole.
     rotation_xyzw : tuple, shape (4,), optional
         Rotation from the axes of the shape to the body's frame; z is the axis of a cylinder or a ring. None: a cylinder
         or ring has its axis along the moment, a cuboid has its edges along the body's axes.
@@ -58,7 +49,7 @@ class Magnet:
     Raises
     ------
     ValueError
-        A number is not finite, the moment is zero, or shape and size do not agree.
+        A number is not finite, the moment is zero, or larger than that of any magnet of this size.
     """
 
     id: str
@@ -67,8 +58,7 @@ class Magnet:
     moment_sigma_Am2: float = 0.0
     position_sigma_m: float = 0.0
     direction_sigma_rad: float = 0.0
-    shape: str = ""
-    size_m: tuple[float, ...] = ()
+    shape: Shape | None = None
     rotation_xyzw: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -85,28 +75,10 @@ class Magnet:
             if abs(np.linalg.norm(xyzw) - 1.0) > 1e-6:
                 raise ValueError(f"Input rotation_xyzw must be a unit quaternion; instead received {xyzw.tolist()}.")
             object.__setattr__(self, "rotation_xyzw", tuple(xyzw.tolist()))
-        self._check_shape()
-
-    def _check_shape(self) -> None:
-        object.__setattr__(self, "size_m", tuple(map(float, self.size_m)))
-        if not self.shape:
-            if self.size_m:
-                raise ValueError(f"Input size_m must come with a shape; instead received {list(self.size_m)} alone.")
-            return
-        if self.shape not in SHAPES:
-            raise ValueError(f"Input shape must be one of {', '.join(SHAPES)}; instead received {self.shape!r}.")
-        words, count = SHAPES[self.shape]
-        if len(self.size_m) != count or not all(0.0 < size < math.inf for size in self.size_m):
-            raise ValueError(
-                f"Input size_m must be the {words} of a {self.shape}, positive; instead received {list(self.size_m)}."
-            )
-        if self.shape == "ring" and not self.size_m[0] < self.size_m[1]:
-            raise ValueError(f"Input size_m must have inner < outer diameter; instead received {list(self.size_m)}.")
-        remanence_T = _MU0 * self.modulus_Am2 / self.volume_m3
-        if not remanence_T <= LARGEST_REMANENCE_T:
+        if self.shape is not None and not self.remanence_T <= LARGEST_REMANENCE_T:
             raise ValueError(
                 f"Input moment_Am2 must be that of a magnet of this size; instead received {self.modulus_Am2:g} A·m²,"
-                f" a remanence of {remanence_T:.3g} T."
+                f" a remanence of {self.remanence_T:.3g} T."
             )
 
     @property
@@ -115,23 +87,16 @@ class Magnet:
         return math.hypot(*self.moment_Am2)
 
     @property
-    def volume_m3(self) -> float:
-        """Volume of the shape [m³]; 0 for a dipole."""
-        size = self.size_m
-        if self.shape == "cuboid":
-            return math.prod(size)
-        if self.shape == "cylinder":
-            return math.pi / 4.0 * size[0] ** 2 * size[1]
-        if self.shape == "ring":
-            return math.pi / 4.0 * (size[1] ** 2 - size[0] ** 2) * size[2]
-        return math.pi / 6.0 * size[0] ** 3 if self.shape else 0.0
+    def remanence_T(self) -> float:
+        """Remanence of the shape [T]; infinite for a dipole."""
+        return _MU0 * self.modulus_Am2 / self.shape.volume_m3 if self.shape is not None else math.inf
 
     @cached_property
     def R_body_from_shape(self) -> FloatArray:
         """Rotation matrix (3, 3) from the axes of the shape to the body's frame."""
         if self.rotation_xyzw is not None:
             return Rotation.from_quat(self.rotation_xyzw).as_matrix()
-        if self.shape not in ("cylinder", "ring"):
+        if self.shape is None or self.shape.kind not in ("cylinder", "ring"):
             return np.eye(3)
         axis = np.array(self.moment_Am2) / self.modulus_Am2
         other = np.eye(3)[np.argmin(np.abs(axis))]
@@ -253,7 +218,7 @@ class MagnetBody:
     @property
     def has_shapes(self) -> bool:
         """True if some magnet is not a dipole."""
-        return any(magnet.shape for magnet in self.magnets)
+        return any(magnet.shape is not None for magnet in self.magnets)
 
     @cached_property
     def moment_root(self) -> FloatArray:
@@ -272,5 +237,5 @@ class MagnetBody:
 
     def as_dipoles(self) -> MagnetBody:
         """Return the body with a dipole in place of every shape."""
-        magnets = tuple(replace(magnet, shape="", size_m=(), rotation_xyzw=None) for magnet in self.magnets)
+        magnets = tuple(replace(magnet, shape=None, rotation_xyzw=None) for magnet in self.magnets)
         return replace(self, magnets=magnets)

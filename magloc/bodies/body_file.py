@@ -28,9 +28,8 @@ from __future__ import annotations
 
 import math
 from os import PathLike
-from typing import Any
+from typing import Annotated, Any
 
-import msgspec
 import numpy as np
 
 from arrays.io.errors import InputError, naming
@@ -43,12 +42,14 @@ from arrays.io.toml import (
     Table,
     check_keys,
     item_place,
+    one_of,
     read_toml,
     section_of,
     toml_value,
 )
 from arrays.typing import Vector
 from magloc.bodies.body import NDFEB_PER_K, Magnet, MagnetBody, PoseLimits
+from magloc.fields.shapes import KINDS, Shape
 
 _PERCENT = 100.0
 _LARGEST_M = 100.0
@@ -62,8 +63,8 @@ class _MagnetTable(Table, kw_only=True):
     moment_sigma_Am2: NotNegative = 0.0
     position_sigma_m: NotNegative = 0.0
     direction_sigma_deg: NotNegative = 0.0
-    shape: str = ""
-    size_m: float | list[float] = msgspec.field(default_factory=list)
+    shape: Annotated[str, one_of(KINDS)] | None = None
+    size_m: float | list[float] | None = None
     rotation_xyzw: tuple[float, float, float, float] | None = None
 
     def check(self) -> None:
@@ -76,6 +77,12 @@ class _MagnetTable(Table, kw_only=True):
             raise RefusalError("moment_Am2", f"found {self.moment_Am2:g}, expected a positive number")
         if self.direction is not None and not any(self.direction):
             raise RefusalError("direction", "found zero, expected a vector of any length")
+
+        if (self.shape is None) != (self.size_m is None):
+            present, missing = ("size_m", "shape") if self.shape is None else ("shape", "size_m")
+            raise RefusalError(present, f"found it without {missing}, expected both keys, or none for a dipole")
+        if self.rotation_xyzw is not None and self.shape is None:
+            raise RefusalError("rotation_xyzw", "found it without a shape, expected the direction of the moment alone")
 
     def magnet(self) -> Magnet:
         """Return the magnet of the table."""
@@ -90,10 +97,14 @@ class _MagnetTable(Table, kw_only=True):
             self.moment_sigma_Am2,
             self.position_sigma_m,
             math.radians(self.direction_sigma_deg),
-            self.shape,
-            tuple(self.size_m) if isinstance(self.size_m, list) else (self.size_m,),
+            self._shape(),
             self.rotation_xyzw,
         )
+
+    def _shape(self) -> Shape | None:
+        if self.shape is None or self.size_m is None:
+            return None
+        return Shape(self.shape, tuple(self.size_m) if isinstance(self.size_m, list) else (self.size_m,))
 
 
 class _RangeTable(Table, kw_only=True):
@@ -196,8 +207,8 @@ def body_toml(body: MagnetBody) -> str:
                 lines.append(f"{key} = {toml_value(getattr(magnet, key))}")
         if magnet.direction_sigma_rad:
             lines.append(f"direction_sigma_deg = {toml_value(math.degrees(magnet.direction_sigma_rad))}")
-        if magnet.shape:
-            lines += [f"shape = {toml_value(magnet.shape)}", f"size_m = {toml_value(list(magnet.size_m))}"]
+        if magnet.shape is not None:
+            lines += [f"shape = {toml_value(magnet.shape.kind)}", f"size_m = {toml_value(list(magnet.shape.size_m))}"]
         if magnet.rotation_xyzw is not None:
             lines.append(f"rotation_xyzw = {toml_value(list(magnet.rotation_xyzw))}")
     if body.limits != PoseLimits():

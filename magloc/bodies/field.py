@@ -16,8 +16,9 @@ import numpy as np
 from scipy.linalg import null_space
 
 from arrays.typing import FloatArray
-from magloc.bodies.body import MagnetBody
+from magloc.bodies.body import Magnet, MagnetBody
 from magloc.fields import dipole
+from magloc.fields.shapes import Shape, fields_or_nan
 from magloc.navigation.rotations import cross_matrix
 
 
@@ -53,9 +54,13 @@ def magnet_fields(body: MagnetBody, points_m: FloatArray, position_m: FloatArray
         Rotation matrix from the body's frame to the array's.
     """
     places, moments = placed_magnets(body, position_m, R)
-    parts = [
-        dipole_fields(points_m, places[..., k, None, :], moments[..., k, None, :]) for k in range(len(body.magnets))
-    ]
+    parts = []
+    for k, magnet in enumerate(body.magnets):
+        place, moment = places[..., k, None, :], moments[..., k, None, :]
+        if magnet.shape is None:
+            parts.append(dipole_fields(points_m, place, moment))
+        else:
+            parts.append(_shape_fields(magnet, magnet.shape, points_m - place, R))
     field_T, by_position, by_rotation = (
         np.stack(part, axis=-3 - extra) for part, extra in zip(zip(*parts, strict=True), (0, 1, 1), strict=True)
     )
@@ -76,6 +81,19 @@ def dipole_fields(
     by_position, by_moment = jacobian[..., :3], jacobian[..., 3:]
     field_T = (by_moment @ moment_Am2[..., None])[..., 0]
     return field_T, by_position, -by_moment @ cross_matrix(moment_Am2)
+
+
+def _shape_fields(
+    magnet: Magnet, shape: Shape, ways_m: FloatArray, R: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return :func:`dipole_fields` of a magnet with a shape, NaN inside it, for ways (..., N, 3) from its centre."""
+    axes = (R @ magnet.R_body_from_shape)[..., None, :, :]
+    moment = magnet.R_body_from_shape.T @ np.array(magnet.moment_Am2)
+    in_shape = (np.swapaxes(axes, -1, -2) @ ways_m[..., None])[..., 0]
+    field, by_point, _ = fields_or_nan(shape, in_shape, moment)
+    field_T = (axes @ field[..., None])[..., 0]
+    gradient = axes @ by_point @ np.swapaxes(axes, -1, -2)
+    return field_T, -gradient, gradient @ cross_matrix(ways_m) - cross_matrix(field_T)
 
 
 def body_fields(body: MagnetBody, points_m: FloatArray, position_m: FloatArray, R: FloatArray) -> FloatArray:

@@ -40,6 +40,19 @@ typedef struct {
 int64_t magloc_dipole_fields(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, int64_t end, double *workspace);
 
+/* Field of a uniformly magnetised body and its derivatives at points outside it, in the body's frame; an item is a
+   point. Inside the body and on its surface everything is NaN. */
+typedef struct {
+  int64_t n_points, shape; /* 0: cuboid, 1: cylinder or ring about z, 2: sphere */
+  double size[3];          /* halves of the edges; inner radius, outer radius, half height; radius, 0, 0 */
+  const double *points;    /* (n_points, 3): from the body's centre */
+  const double *moments;   /* (n_points, 3) */
+  double *fields;          /* (n_points, 3) */
+  double *matrices;        /* (n_points, 3, 3): the fields by the moment */
+  double *gradients;       /* (n_points, 3, 3): the fields by the point */
+} magloc_magnets;
+int64_t magloc_shape_fields(const magloc_magnets *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Attitudes of a camera that triangles of its image's stars state by those of a catalogue. An item is a triangle of the
    image; calls are in order, and compute nothing more once the best attitudes match enough stars or enough attitudes
    were tried. Corners are ordered by the opposite side, shortest first; sides, all in units of the sphere's radius,
@@ -345,6 +358,37 @@ typedef struct {
   uint8_t *converged;         /* (n_starts) */
 } magloc_refinement;
 int64_t magloc_refine(const magloc_refinement *problem, int64_t begin, int64_t end, double *workspace);
+
+/* A rigid body of dipoles; an item is a start. A pose is its position, in radii from the array's centroid, and the
+   rotation matrix from the body's frame to the array's. Covariances are of the position in radii and of a small
+   rotation about the array's axes. */
+typedef struct {
+  const magloc_channels *channels;
+  int64_t n_magnets, max_iterations;
+  double tolerance, relative_tolerance; /* a fit ends if a step would lower chi-square by less */
+  const double *places, *moments;       /* (n_magnets, 3) in the body's frame: radii, and T at one radius */
+  const double *signals;            /* (n_rows, n_channels) whitened readings; of moduli, above the ambient field's */
+  const int64_t *row;               /* (n_starts) of the readings */
+  const double *start;              /* (n_starts, 12) */
+  double *pose, *chi2, *covariance; /* (n_starts, 12), (n_starts), (n_starts, 6, 6) */
+  int64_t *iterations;              /* (n_starts) */
+  uint8_t *converged;               /* (n_starts) */
+} magloc_pose_refinement;
+int64_t magloc_refine_poses(const magloc_pose_refinement *problem, int64_t begin, int64_t end, double *workspace);
+
+/* Distinct poses of a body that fit a row of readings, best first; an item is a row. */
+typedef struct {
+  const magloc_pose_refinement *fit; /* its row: of each item; starts and results are not used */
+  int64_t n_candidates, n_features, n_starts, n_kept;
+  double keep_within;       /* above the best optimum's chi-square */
+  double apart;             /* least distance of two starts, in radii and radians together */
+  const double *candidates; /* (n_candidates, 12) */
+  const float *table;       /* (n_features, n_candidates) */
+  const float *features;    /* (n_rows, n_features) of the readings; starts have the largest products with the table */
+  double *pose, *chi2, *covariance; /* (n_rows, n_kept, 12), (n_rows, n_kept), (n_rows, n_kept, 6, 6); NaN for none */
+  int64_t *counts;                  /* (n_rows, 3): optima, starts that did not converge, linearisations */
+} magloc_pose_search;
+int64_t magloc_search_poses(const magloc_pose_search *problem, int64_t begin, int64_t end, double *workspace);
 
 /* Orthonormal readings of the three unit moments at candidate positions, by channels of one set; an item is a
    candidate. */

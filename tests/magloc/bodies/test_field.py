@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from magloc.bodies.body import Magnet, MagnetBody
 from magloc.bodies.field import body_fields, magnet_errors, magnet_fields, pose_jacobian
 from magloc.fields import dipole
+from magloc.fields.shapes import Shape
 
 BODY = MagnetBody(
     (
@@ -20,6 +21,13 @@ BODY = MagnetBody(
         Magnet("m3", (-0.003, -0.005, 0.0), (0.0, -0.05, 0.01), moment_sigma_Am2=0.001),
     ),
     temperature_sigma_K=10.0,
+)
+SHAPED = MagnetBody(
+    (
+        replace(BODY.magnets[0], shape=Shape("cylinder", (0.004, 0.005))),
+        replace(BODY.magnets[1], shape=Shape("cuboid", (0.004, 0.003, 0.005)), rotation_xyzw=(0.6, 0.0, 0.0, 0.8)),
+        replace(BODY.magnets[2], shape=Shape("ring", (0.002, 0.005, 0.004))),
+    )
 )
 SENSORS = np.array([[0.01, 0.0, 0.0], [-0.005, 0.0087, 0.0], [-0.005, -0.0087, 0.0]])
 
@@ -38,17 +46,18 @@ def test_field_is_the_sum_of_the_magnets_in_the_array_frame(poses: tuple[np.ndar
         np.testing.assert_allclose(field, dipole.total_field(SENSORS, sources, moments), rtol=1e-12)
 
 
-def test_jacobian_agrees_with_central_differences(poses: tuple[np.ndarray, np.ndarray]) -> None:
+@pytest.mark.parametrize("body", [BODY, SHAPED])
+def test_jacobian_agrees_with_central_differences(body: MagnetBody, poses: tuple[np.ndarray, np.ndarray]) -> None:
     position_m, R = poses
-    jacobian = pose_jacobian(BODY, magnet_fields(BODY, SENSORS, position_m, R), R)
+    jacobian = pose_jacobian(body, magnet_fields(body, SENSORS, position_m, R), R)
     for axis in range(6):
         h = 1e-7 if axis < 3 else 1e-5
         step = h * np.eye(3)[axis % 3]
 
         def moved(sign: float, step: np.ndarray = step, axis: int = axis) -> np.ndarray:
             if axis < 3:
-                return body_fields(BODY, SENSORS, position_m + sign * step, R)
-            return body_fields(BODY, SENSORS, position_m, R @ Rotation.from_rotvec(sign * step).as_matrix())
+                return body_fields(body, SENSORS, position_m + sign * step, R)
+            return body_fields(body, SENSORS, position_m, R @ Rotation.from_rotvec(sign * step).as_matrix())
 
         difference = (moved(1.0) - moved(-1.0)) / (2.0 * h)
         np.testing.assert_allclose(jacobian[..., axis], difference, rtol=1e-6, atol=1e-7 * np.abs(difference).max())
@@ -91,3 +100,22 @@ def test_errors_of_places_and_directions_are_differences_of_bodies(poses: tuple[
     np.testing.assert_allclose(
         of_errors @ of_errors.mT, columns @ columns.mT, rtol=1e-4, atol=1e-4 * np.max(columns**2)
     )
+
+
+def test_shapes_stand_and_turn_as_in_magpylib(poses: tuple[np.ndarray, np.ndarray]) -> None:
+    magpylib = pytest.importorskip("magpylib")
+    for x, turn, field in zip(*poses, body_fields(SHAPED, SENSORS, *poses), strict=True):
+        expected = np.zeros((3, 3))
+        for magnet, kind in zip(SHAPED.magnets, ("Cylinder", "Cuboid", "CylinderSegment"), strict=True):
+            assert magnet.shape is not None
+            size = magnet.shape.size_m
+            dimension = (size[0] / 2, size[1] / 2, size[2], 0, 360) if kind == "CylinderSegment" else size
+            axes = magnet.R_body_from_shape
+            source = getattr(magpylib.magnet, kind)(
+                magnetization=axes.T @ np.array(magnet.moment_Am2) / magnet.shape.volume_m3,
+                dimension=dimension,
+                position=x + turn @ np.array(magnet.position_m),
+                orientation=Rotation.from_matrix(turn @ axes),
+            )
+            expected += source.getB(SENSORS)
+        np.testing.assert_allclose(field, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())

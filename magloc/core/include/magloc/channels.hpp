@@ -5,7 +5,8 @@
 //   read(s, f, rows)            turns columns f (3, 3) of fields at sensor s into its rows of a matrix (n, D),
 //   project(columns)            takes the common field out of a matrix (n, D) of channels,
 //   linearise(rays, mu)         linearises channels that are not linear in the field about that of moments mu,
-//   residual(rays, mu, r)       then fills the exact residual.
+//   residual(rays, mu, r)       then fills the exact residual,
+//   linearise_at(s, b), fill_residual(s, b, r)    do the same for a field b at one sensor, before `project`.
 #pragma once
 #include "dipole.hpp"
 #include "kernel.hpp"
@@ -122,12 +123,20 @@ struct General {
     for (; k + 3 <= m_.n_common; k += 3) project_some<D, 3>(common_ + k * n_channels, columns);
     for (; k < m_.n_common; ++k) project_some<D, 1>(common_ + k * n_channels, columns);
   }
+  MAGLOC_INLINE void linearise_at(int64_t, const T (&)[3]) const {}
+  MAGLOC_INLINE void fill_residual(int64_t s, const T (&b)[3], T *r) const {
+    for (int64_t c = first(s); c < first(s + 1); ++c) r[c] = y[c] - gain_of(c, b);
+  }
   bool few_digits_do(int64_t) const { return false; }
 
  protected:
   const magloc_channels &m_;
   const double *const signals_;
   T *const gain_, *const common_;
+
+  MAGLOC_INLINE T gain_of(int64_t c, const T (&b)[3]) const {
+    return gain_[3 * c] * b[0] + gain_[3 * c + 1] * b[1] + gain_[3 * c + 2] * b[2];
+  }
 
  private:
   int64_t set_of_lane_[n_lanes<T>];
@@ -171,29 +180,37 @@ struct Moduli : General<T> {
   }
   template <int K>
   MAGLOC_INLINE void linearise(const Ray<T> *rays, const T (&mu)[K][3]) {
-    for (int64_t s = 0; s < n_sensors; ++s)
-      for (int64_t c = this->first(s); c < this->first(s + 1); ++c) {
-        if (!m_.is_modulus[c]) continue;
-        T b[3], direction[3];
-        field_of<K>(rays + s * K, mu, b);
-        const T rise = rise_of_modulus(b, ambient_ + 4 * s, direction);
-        for (int a = 0; a < 3; ++a) gain_[3 * c + a] = weight_[c] * direction[a];
-        y[c] = reading_[c] - weight_[c] * (rise - dot(direction, b));
-      }
+    for (int64_t s = 0; s < n_sensors; ++s) {
+      T b[3];
+      field_of<K>(rays + s * K, mu, b);
+      linearise_at(s, b);
+    }
   }
   template <int K>
   MAGLOC_INLINE void residual(const Ray<T> *rays, const T (&mu)[K][3], T *r) const {
     for (int64_t c = 0; c < n_channels; ++c) r[c] = reading_[c];
     for (int64_t s = 0; s < n_sensors; ++s) {
-      T b[3], direction[3];
+      T b[3];
       field_of<K>(rays + s * K, mu, b);
-      const T rise = rise_of_modulus(b, ambient_ + 4 * s, direction);
-      for (int64_t c = this->first(s); c < this->first(s + 1); ++c) {
-        const T *g = gain_ + 3 * c;
-        r[c] -= m_.is_modulus[c] ? weight_[c] * rise : g[0] * b[0] + g[1] * b[1] + g[2] * b[2];
-      }
+      fill_residual(s, b, r);
     }
     this->template project<1>(r);
+  }
+  // The same for any field b at one sensor; the residual still has the common field.
+  MAGLOC_INLINE void linearise_at(int64_t s, const T (&b)[3]) {
+    for (int64_t c = this->first(s); c < this->first(s + 1); ++c) {
+      if (!m_.is_modulus[c]) continue;
+      T direction[3];
+      const T rise = rise_of_modulus(b, ambient_ + 4 * s, direction);
+      for (int a = 0; a < 3; ++a) gain_[3 * c + a] = weight_[c] * direction[a];
+      y[c] = reading_[c] - weight_[c] * (rise - dot(direction, b));
+    }
+  }
+  MAGLOC_INLINE void fill_residual(int64_t s, const T (&b)[3], T *r) const {
+    T direction[3];
+    const T rise = rise_of_modulus(b, ambient_ + 4 * s, direction);
+    for (int64_t c = this->first(s); c < this->first(s + 1); ++c)
+      r[c] = reading_[c] - (m_.is_modulus[c] ? weight_[c] * rise : this->gain_of(c, b));
   }
 
  private:

@@ -20,11 +20,12 @@ inline T arc_tangent(T x) {
 }
 
 // The angle of the vector (x, y), from -pi to pi; zero of a vector that is zero.
-inline double arc_tangent(double y, double x) {
-  if (x == 0.0 && y == 0.0) return 0.0;
+template <class T>
+inline T arc_tangent(T y, T x) {
   constexpr double pi = 3.141592653589793;
-  const double acute = arc_tangent(__builtin_fabs(y) / __builtin_fabs(x)), angle = x < 0.0 ? pi - acute : acute;
-  return y < 0.0 ? -angle : angle;
+  const T height = absolute(y), width = absolute(x), acute = arc_tangent(height / width);
+  const T angle = choose(height + width > 0.0, choose(x < 0.0, pi - acute, acute), height + width);
+  return choose(y < 0.0, -angle, angle);
 }
 
 // The hyperbolic tangent of a number that is not negative. tanh(2x) = 2t/(1 + t^2) doubles a small one.
@@ -39,25 +40,52 @@ inline T hyperbolic_tangent(T x) {
   return t;
 }
 
-// The natural logarithm; NaN of a negative number. With x = 2^e m and s = (m - 1)/(m + 1) it is
-// e log(2) + 2 (s + s^3/3 + s^5/5 + ...).
-inline double logarithm(double x) {
-  if (!(x > 0.0 && x < infinity)) return x == 0.0 ? -infinity : x > 0.0 ? x : nan;
-  int exponent = 0;
-  if (x < 0x1p-1022) x *= 0x1p54, exponent = -54;
+// Write a positive number as 2^exponent m with 1 <= m < 2.
+inline void split_exponent(double x, double &exponent, double &m) {
   uint64_t bits;
   __builtin_memcpy(&bits, &x, sizeof bits);
-  exponent += int(bits >> 52) - 1023;
+  exponent = double(int(bits >> 52) - 1023);
   bits = (bits & 0xfffffffffffff) | 0x3ff0000000000000;
-  double m;
   __builtin_memcpy(&m, &bits, sizeof m);
-  if (m > 1.4142135623730951) m *= 0.5, ++exponent;
-  const double s = (m - 1.0) / (m + 1.0), square = s * s;  // up to 0.03
-  double series = 0.0;
+}
+#if MAGLOC_LANES > 1
+inline void split_exponent(Lanes x, Lanes &exponent, Lanes &m) {
+  const Mask bits = (Mask)x;
+  exponent = (Lanes)((bits >> 52) | 0x4330000000000000) - (0x1p52 + 1023.0);  // an integer to a double without a loop
+  m = (Lanes)((bits & 0xfffffffffffff) | 0x3ff0000000000000);
+}
+#endif
+
+// Logarithm of 2^exponent (1 + s)/(1 - s): exponent log(2) + 2 (s + s^3/3 + s^5/5 + ...).
+template <class T>
+MAGLOC_INLINE T logarithm_of_ratio(T exponent, T s) {
+  const T square = s * s;  // up to 0.03
+  T series{};
   for (int k = 21; k >= 3; k -= 2) series = 1.0 / k + square * series;
   // log(2) in two parts, of which the first one times an exponent is exact.
   constexpr double log_2_high = 0x1.62e42feep-1, log_2_low = 0x1.a39ef35793c76p-33;
   return exponent * log_2_high + (exponent * log_2_low + 2.0 * s * square * series + 2.0 * s);
+}
+
+// The natural logarithm; NaN of a negative number.
+inline double logarithm(double x) {
+  if (!(x > 0.0 && x < infinity)) return x == 0.0 ? -infinity : x > 0.0 ? x : nan;
+  double less = 0.0, exponent, m;
+  if (x < 0x1p-1022) x *= 0x1p54, less = 54.0;
+  split_exponent(x, exponent, m);
+  if (m > 1.4142135623730951) m *= 0.5, exponent += 1.0;
+  return logarithm_of_ratio(exponent - less, (m - 1.0) / (m + 1.0));
+}
+
+// The natural logarithm of 1 + x for x >= 0, to a few units in the last place also of a small one.
+template <class T>
+inline T logarithm_of_1_plus(T x) {
+  T exponent, m;
+  split_exponent(1.0 + x, exponent, m);
+  const auto is_large = m > 1.4142135623730951;
+  m = choose(is_large, 0.5 * m, m);
+  exponent = choose(is_large, exponent + 1.0, exponent);
+  return logarithm_of_ratio(exponent, choose(exponent > 0.0, m - 1.0, x) / choose(exponent > 0.0, m + 1.0, 2.0 + x));
 }
 
 // Sine and cosine of an angle up to pi/2 in size: power series of half of it, then the formulas of the double angle.

@@ -7,6 +7,7 @@
 #define MAGLOC_KERNELS(X)                     \
   X(dipole_fields, dipoles)                   \
   X(dipole_gradients, dipoles)                \
+  X(shape_fields, magnets)                    \
   X(star_search, star_triangles)              \
   X(complementary_filter, complementary)      \
   X(adaptive_filter, adaptive)                \
@@ -24,6 +25,8 @@
   X(mekf_runs, mekf)                          \
   X(filter_starts, starts)                    \
   X(refine, refinement)                       \
+  X(refine_poses, pose_refinement)            \
+  X(search_poses, pose_search)                \
   X(candidate_bases, candidate_positions)     \
   X(choose_candidates, candidate_choice)      \
   X(search_optima, search)                    \

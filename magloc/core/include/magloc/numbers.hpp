@@ -85,6 +85,20 @@ MAGLOC_INLINE double sum_of_lanes(const T &x) {
   return sum;
 }
 template <class T>
+MAGLOC_INLINE T absolute(T x) {
+  return choose(x < 0.0, -x, x);
+}
+MAGLOC_INLINE bool any_lane(bool condition) { return condition; }
+MAGLOC_INLINE bool all_lanes(bool condition) { return condition; }
+#if MAGLOC_LANES > 1
+MAGLOC_INLINE bool any_lane(Mask condition) {
+  return sum_of_lanes(choose(condition, broadcast<Lanes>(1.0), Lanes{})) > 0.0;
+}
+MAGLOC_INLINE bool all_lanes(Mask condition) {
+  return sum_of_lanes(choose(condition, broadcast<Lanes>(1.0), Lanes{})) == n_lanes<Lanes>;
+}
+#endif
+template <class T>
 MAGLOC_INLINE T maximum(T a, T b) {
   return choose(a > b, a, b);
 }

@@ -1,0 +1,404 @@
+// Pose of a rigid body of dipoles: damped Gauss-Newton from many starts side by side, one in each lane, and the search
+// without a start. magloc/bodies/fit.py is the readable reference of the fit, magloc/bodies/search.py of the search.
+//
+// Magnet k stands at x + R p_k with the moment R m_k. A step (dx, psi) leads to x + dx and exp([psi]) R: psi is about
+// the array's axes.
+#pragma once
+#include "channels.hpp"
+#include "lane_items.hpp"
+#include "linear.hpp"
+
+MAGLOC_BEGIN
+// Longest rotation of a step, and longest translation over the way from the nearest magnet to its sensor.
+constexpr double longest_turn = 0.5, longest_way = 0.5;
+// A body that strays so far has no field that counts, in radii.
+constexpr double farthest_pose = 1e3;
+constexpr double largest_pose_damping = 1e9, idle_gain = 1e-7;
+// Only an optimum that explains the readings, by its chi-square over the channels, ends other starts: a better one may
+// lie beside a local one.
+constexpr double explained_by_channels = 4.0;
+
+template <class T>
+struct PoseState {
+  T x[3], R[3][3], chi2, nearest;    // nearest: the largest inverse distance of a magnet from a sensor
+  T information[6][6], gradient[6];  // lower triangle of J^T J, and J^T r
+};
+
+// An optimum that starts may lead to; NaN if there is none. Chi-square above `limit` is of no use.
+struct KnownPose {
+  double x[3], R[9], chi2, limit;
+};
+
+struct PoseEnds {
+  double *pose, *chi2, *covariance;
+  int64_t *iterations;
+  uint8_t *converged;
+
+  PoseEnds from(int64_t i) const {
+    return {pose + 12 * i, chi2 + i, covariance + 36 * i, iterations + i, converged + i};
+  }
+};
+
+template <class T>
+class PoseFit {
+  static constexpr int D = 6;
+  const magloc_pose_refinement &p_;
+  T *const arms_, *const moments_, *const columns_, *const residual_;
+
+ public:
+  template <class Channels>
+  PoseFit(const magloc_pose_refinement &p, const Channels &c, Workspace &room)
+      : p_(p),
+        arms_(room.take<T>(3 * p.n_magnets)),
+        moments_(room.take<T>(3 * p.n_magnets)),
+        columns_(room.take<T>(D * c.n_channels)),
+        residual_(room.take<T>(c.n_channels)) {}
+
+  template <class Channels>
+  void run(Channels &c, int64_t n, const int64_t *row, const double *start, const KnownPose *known,
+           const PoseEnds &out) {
+    enum : int { running = 0, converged = 1, failed = 2 };
+    PoseState<T> at, trial;
+    clear(at), clear(trial);
+    T damping = {}, promised = {}, iterations = {}, end = broadcast<T>(failed);
+    T known_x[3] = {}, known_R[3][3] = {}, known_chi2 = broadcast<T>(nan), limit = broadcast<T>(infinity);
+    int64_t loaded[n_lanes<T>];
+    for (int64_t &r : loaded) r = -1;
+    LaneItems<T> items(0, n);
+    const auto begin = [&](int lane, int64_t k, bool) {
+      for (int a = 0; a < 3; ++a) set_lane(trial.x[a], lane, start[12 * k + a]);
+      for (int a = 0; a < 9; ++a) set_lane(trial.R[a / 3][a % 3], lane, start[12 * k + 3 + a]);
+      set_lane(at.chi2, lane, infinity), set_lane(damping, lane, 1e-3), set_lane(promised, lane, 0.0);
+      set_lane(iterations, lane, 0.0), set_lane(end, lane, running);
+      if (known) {
+        for (int a = 0; a < 3; ++a) set_lane(known_x[a], lane, known[k].x[a]);
+        for (int a = 0; a < 9; ++a) set_lane(known_R[a / 3][a % 3], lane, known[k].R[a]);
+        set_lane(known_chi2, lane, known[k].chi2), set_lane(limit, lane, known[k].limit);
+      }
+      if (row[k] != loaded[lane]) loaded[lane] = row[k], c.load(lane, row[k]);
+    };
+    const auto finish = [&](int lane, int64_t k) {
+      for (int a = 0; a < 3; ++a) out.pose[12 * k + a] = get_lane(at.x[a], lane);
+      for (int a = 0; a < 9; ++a) out.pose[12 * k + 3 + a] = get_lane(at.R[a / 3][a % 3], lane);
+      out.chi2[k] = get_lane(at.chi2, lane);
+      out.iterations[k] = (int64_t)get_lane(iterations, lane);
+      out.converged[k] = get_lane(end, lane) == converged;
+      fill_covariance(at, lane, out.covariance + 36 * k);
+    };
+    while (items.refill(end, begin)) {
+      linearise(c, trial);
+
+      // Take a trial pose with a lower chi-square, and adapt the damping to how well its gain was predicted.
+      const T gained = at.chi2 - trial.chi2;
+      const auto taken = gained > 0.0;
+      const T worse = 3.0 * maximum(damping, broadcast<T>(0.1));
+      const T same = choose(gained < 0.5 * promised, worse, damping);
+      const T when_taken = choose(gained > 0.75 * promised, 0.1 * damping, same);
+      const T when_refused = 5.0 * maximum(damping, broadcast<T>(1e-4));
+      damping = choose(at.chi2 < infinity, choose(taken, when_taken, when_refused), damping);
+      T *const to = reinterpret_cast<T *>(&at);
+      const T *const from = reinterpret_cast<const T *>(&trial);
+      for (unsigned j = 0; j < sizeof(at) / sizeof(T); ++j) to[j] = choose(taken, from[j], to[j]);
+      iterations += broadcast<T>(1.0);
+
+      // Judge the pose by what an undamped step would gain.
+      T ridge[D], step[D], decrement = {};
+      for (int j = 0; j < D; ++j) ridge[j] = 1e-12 * at.information[j][j];
+      Ldl<T, D>(at.information, T{}, ridge, 0.0).solve(at.gradient, step);
+      for (int j = 0; j < D; ++j) decrement += at.gradient[j] * step[j];
+      const T small = p_.tolerance + p_.relative_tolerance * at.chi2, none = broadcast<T>(failed);
+      end = choose(iterations >= broadcast<T>((double)p_.max_iterations), none, T{});
+      end = choose(damping > largest_pose_damping, none, end);
+      end = choose(at.chi2 - 10.0 * decrement > limit, none, end);
+      // Where the readings fold, what an undamped step promises never vanishes: steps that gain nothing end there.
+      const auto idle = taken & (gained < idle_gain * (1.0 + at.chi2)) & (damping < 10.0);
+      end = choose(idle, broadcast<T>(converged), end);
+      end = choose(decrement < small, broadcast<T>(converged), end);
+      end = choose(decrement < infinity, choose(at.chi2 < infinity, end, none), none);
+      end = choose(dot(at.x, at.x) < farthest_pose * farthest_pose, end, none);
+      if (known) end = choose(leads_to(at, decrement, known_x, known_R, known_chi2), none, end);
+
+      Ldl<T, D>(at.information, damping, ridge, 0.0).solve(at.gradient, step);
+      promised = move(at, step, trial);
+      items.release(end, finish);
+    }
+  }
+
+  // Sum of the fields of all magnets at a sensor.
+  template <class Channels>
+  void place_magnets(const Channels &, const PoseState<T> &p) {
+    for (int64_t k = 0; k < p_.n_magnets; ++k)
+      for (int i = 0; i < 3; ++i) {
+        const double *a = p_.places + 3 * k, *m = p_.moments + 3 * k;
+        arms_[3 * k + i] = p.R[i][0] * a[0] + p.R[i][1] * a[1] + p.R[i][2] * a[2];
+        moments_[3 * k + i] = p.R[i][0] * m[0] + p.R[i][1] * m[1] + p.R[i][2] * m[2];
+      }
+  }
+
+ private:
+  static void clear(PoseState<T> &state) {
+    T *x = reinterpret_cast<T *>(&state);
+    for (unsigned j = 0; j < sizeof(state) / sizeof(T); ++j) x[j] = T{};
+  }
+
+  // Chi-square and normal equations of the trial poses.
+  template <class Channels>
+  void linearise(Channels &c, PoseState<T> &p) {
+    place_magnets(c, p);
+    p.nearest = T{};
+    for (int64_t i = c.first(c.n_sensors); i < c.n_channels; ++i) {
+      residual_[i] = c.y[i];
+      for (int j = 0; j < D; ++j) columns_[D * i + j] = T{};
+    }
+    for (int64_t s = 0; s < c.n_sensors; ++s) {
+      T b[3] = {}, by_place[3][3] = {}, by_turn[3][3] = {};
+      for (int64_t k = 0; k < p_.n_magnets; ++k) {
+        const T(&arm)[3] = reinterpret_cast<const T(&)[3]>(arms_[3 * k]);
+        const T(&m)[3] = reinterpret_cast<const T(&)[3]>(moments_[3 * k]);
+        T d[3], of_magnet[3], g[3][3], a[3][3];
+        for (int i = 0; i < 3; ++i) d[i] = c.sensors[3 * s + i] - p.x[i] - arm[i];
+        const Ray<T> ray = Ray<T>::from(d);
+        p.nearest = maximum(p.nearest, ray.inverse_r);
+        field(ray, m, of_magnet);
+        gradient(ray, m, g);
+        field_matrix(ray, a);
+        for (int i = 0; i < 3; ++i) {
+          T of_moment[3], of_arm[3];
+          cross(m, a[i], of_moment);
+          cross(arm, g[i], of_arm);
+          b[i] += of_magnet[i];
+          for (int j = 0; j < 3; ++j) {
+            by_place[i][j] -= g[i][j];
+            by_turn[i][j] += of_moment[j] - of_arm[j];
+          }
+        }
+      }
+      c.linearise_at(s, b);
+      c.fill_residual(s, b, residual_);
+      c.template read<D>(s, by_place, columns_ + D * c.first(s));
+      c.template read<D>(s, by_turn, columns_ + D * c.first(s) + 3);
+    }
+    c.template project<1>(residual_);
+    c.template project<D>(columns_);
+    T information[D][D] = {}, gradient[D] = {}, chi2 = {};
+    for (int64_t i = 0; i < c.n_channels; ++i) {
+      const T *row = columns_ + D * i;
+      chi2 += residual_[i] * residual_[i];
+      for (int j = 0; j < D; ++j) {
+        gradient[j] += row[j] * residual_[i];
+        for (int k = 0; k <= j; ++k) information[j][k] += row[j] * row[k];
+      }
+    }
+    p.chi2 = chi2;
+    for (int j = 0; j < D; ++j) {
+      p.gradient[j] = gradient[j];
+      for (int k = 0; k <= j; ++k) p.information[j][k] = information[j][k];
+    }
+  }
+
+  // The trial pose after a step of bounded length; by how much it promises to lower chi-square.
+  static T move(const PoseState<T> &at, T (&step)[D], PoseState<T> &trial) {
+    const T way2 = (step[0] * step[0] + step[1] * step[1] + step[2] * step[2]) * at.nearest * at.nearest;
+    const T turn2 = step[3] * step[3] + step[4] * step[4] + step[5] * step[5];
+    const T long2 = maximum(way2 * (1.0 / (longest_way * longest_way)), turn2 * (1.0 / (longest_turn * longest_turn)));
+    const T share = choose(long2 > 1.0, inverse_root(long2), broadcast<T>(1.0));
+    for (T &x : step) x *= share;
+    T promised = {};
+    for (int j = 0; j < D; ++j) {
+      T curvature = {};
+      for (int k = 0; k < D; ++k) curvature += at.information[j > k ? j : k][j > k ? k : j] * step[k];
+      promised += step[j] * (2.0 * at.gradient[j] - curvature);
+    }
+    for (int a = 0; a < 3; ++a) trial.x[a] = at.x[a] + step[a];
+    const T turn[3] = {step[3], step[4], step[5]};
+    rotate(turn, at.R, trial.R);
+    return promised;
+  }
+
+  // Rotate by a small vector, to its second order, as the unit quaternion (psi/2, 1) does; R stays a rotation.
+  static MAGLOC_INLINE void rotate(const T (&psi)[3], const T (&R)[3][3], T (&result)[3][3]) {
+    const T h[3] = {0.5 * psi[0], 0.5 * psi[1], 0.5 * psi[2]}, scale = 2.0 / (1.0 + dot(h, h));
+    for (int j = 0; j < 3; ++j) {
+      const T v[3] = {R[0][j], R[1][j], R[2][j]};
+      T once[3], twice[3];
+      cross(h, v, once);
+      for (int i = 0; i < 3; ++i) twice[i] = v[i] + once[i];
+      cross(h, twice, once);
+      for (int i = 0; i < 3; ++i) result[i][j] = v[i] + scale * once[i];
+    }
+  }
+
+  // Whether poses are so near a known optimum that they lead to it, as far as their chi-square promises the same.
+  MAGLOC_INLINE static auto leads_to(const PoseState<T> &at, const T &decrement, const T (&x)[3], const T (&R)[3][3],
+                                     const T &chi2) {
+    constexpr double beside2 = 0.0025, share = 0.3;
+    T way2 = {}, turn2 = {};
+    for (int i = 0; i < 3; ++i) {
+      way2 += (at.x[i] - x[i]) * (at.x[i] - x[i]);
+      for (int j = 0; j < 3; ++j) turn2 += (at.R[i][j] - R[i][j]) * (at.R[i][j] - R[i][j]);
+    }
+    const T beyond = at.chi2 - decrement - chi2, most = share * decrement + 1e-3;
+    return (way2 * at.nearest * at.nearest + 0.5 * turn2 < beside2) & (beyond < most) & (-beyond < most);
+  }
+
+  // Inverse of the information, which is scaled to a unit diagonal; NaN if it is singular.
+  static void fill_covariance(const PoseState<T> &at, int lane, double *covariance) {
+    double scale[D], a[D][D];
+    for (int j = 0; j < D; ++j) scale[j] = 1.0 / square_root(get_lane(at.information[j][j], lane));
+    for (int j = 0; j < D; ++j)
+      for (int k = 0; k <= j; ++k) a[j][k] = scale[j] * scale[k] * get_lane(at.information[j][k], lane);
+    const double definite = Ldl<double, D>(a, 1e-13).definite();
+    invert_and_negate(a);
+    for (int j = 0; j < D; ++j)
+      for (int k = 0; k <= j; ++k)
+        covariance[D * j + k] = covariance[D * k + j] = -definite * scale[j] * scale[k] * a[j][k];
+  }
+};
+
+// Search for the pose that fits a row: the candidates of a table that are most like the readings are refined, and the
+// distinct optima are put out, best first.
+template <class T, class Channels>
+class PoseSearch {
+  static constexpr int64_t block = 64;
+  static constexpr double same_way2 = 1e-8, same_turn2 = 1e-8;
+  const magloc_pose_search &p_;
+  Channels channels_;
+  PoseFit<T> fit_;
+  const int64_t n_blocks_;
+  float *const score_, *const highest_;
+  double *const start_;
+  KnownPose *const known_;
+  int64_t *const row_, *const iterations_;
+  uint8_t *const converged_;
+  const PoseEnds ends_;
+
+ public:
+  static constexpr int64_t rows_together = 16;
+
+  PoseSearch(const magloc_pose_search &p, Workspace &room)
+      : p_(p),
+        channels_(*p.fit->channels, p.fit->signals, room),
+        fit_(*p.fit, channels_, room),
+        n_blocks_((p.n_candidates + block - 1) / block),
+        score_(room.take<float>(n_blocks_ * block)),
+        highest_(room.take<float>(n_blocks_)),
+        start_(room.take<double>(12 * rows_together * p.n_starts)),
+        known_(room.take<KnownPose>(rows_together * p.n_starts)),
+        row_(room.take<int64_t>(rows_together * p.n_starts)),
+        iterations_(room.take<int64_t>(rows_together * p.n_starts)),
+        converged_(room.take<uint8_t>(rows_together * p.n_starts)),
+        ends_{room.take<double>(12 * rows_together * p.n_starts), room.take<double>(rows_together * p.n_starts),
+              room.take<double>(36 * rows_together * p.n_starts), iterations_, converged_} {}
+
+  // The first starts of all rows come first: what they find ends others that lead there, too.
+  void run(int64_t begin, int64_t n_rows) {
+    const int64_t n = p_.n_starts, n_first = n < 2 ? n : 2;
+    const double explained = explained_by_channels * channels_.n_channels;
+    for (int64_t i = 0; i < n_rows; ++i) choose_starts(begin + i, i, n_rows, n_first);
+    for (int64_t j = 0; j < n_rows * n; ++j) {
+      row_[j] = p_.fit->row[begin + row_[j]];
+      known_[j].chi2 = nan, known_[j].limit = infinity;
+    }
+    fit_.run(channels_, n_rows * n_first, row_, start_, nullptr, ends_);
+    for (int64_t i = 0; i < n_rows; ++i) {
+      KnownPose known{{}, {}, nan, infinity};
+      for (int64_t k = 0; k < n_first; ++k) {
+        const int64_t e = n_first * i + k;
+        if (!ends_.converged[e] || !(ends_.chi2[e] < explained) || ends_.chi2[e] >= known.limit) continue;
+        __builtin_memcpy(known.x, ends_.pose + 12 * e, sizeof(known.x) + sizeof(known.R));
+        known.chi2 = ends_.chi2[e], known.limit = ends_.chi2[e] + p_.keep_within;
+      }
+      for (int64_t k = n_first; k < n; ++k) known_[place(i, k, n_rows, n_first)] = known;
+    }
+    const int64_t done = n_rows * n_first;
+    fit_.run(channels_, n_rows * n - done, row_ + done, start_ + 12 * done, known_ + done, ends_.from(done));
+    for (int64_t i = 0; i < n_rows; ++i) put_optima(begin + i, i, n_rows, n_first);
+  }
+
+ private:
+  int64_t place(int64_t i, int64_t k, int64_t n_rows, int64_t n_first) const {
+    return k < n_first ? n_first * i + k : n_first * n_rows + (p_.n_starts - n_first) * i + k - n_first;
+  }
+
+  void choose_starts(int64_t row, int64_t i, int64_t n_rows, int64_t n_first) {
+    const float *q = p_.features + p_.n_features * row;
+    const int64_t n = p_.n_candidates;
+    for (int64_t j = 0; j < n_blocks_ * block; ++j) score_[j] = j < n ? 0.0f : -__builtin_inff();
+    for (int64_t f = 0; f < p_.n_features; ++f) {
+      const float *column = p_.table + f * n, x = q[f];
+      for (int64_t j = 0; j < n; ++j) score_[j] += x * column[j];
+    }
+    for (int64_t b = 0; b < n_blocks_; ++b) highest_[b] = largest(score_ + b * block, block);
+    for (int64_t found = 0; found < p_.n_starts;) {
+      const float best = largest(highest_, n_blocks_);
+      const int64_t at = place(i, found, n_rows, n_first);
+      row_[at] = i;
+      if (!(best > -__builtin_inff())) {  // none is left: the best again
+        __builtin_memcpy(start_ + 12 * at, start_ + 12 * place(i, 0, n_rows, n_first), 12 * sizeof(double));
+        ++found;
+        continue;
+      }
+      const int64_t b = first_of(best, highest_), j = b * block + first_of(best, score_ + b * block);
+      score_[j] = -__builtin_inff();
+      highest_[b] = largest(score_ + b * block, block);
+      bool near = false;
+      for (int64_t k = 0; k < found && !near; ++k)
+        near = square_of_distance(start_ + 12 * place(i, k, n_rows, n_first), p_.candidates + 12 * j) <
+               p_.apart * p_.apart;
+      if (near) continue;
+      __builtin_memcpy(start_ + 12 * at, p_.candidates + 12 * j, 12 * sizeof(double));
+      ++found;
+    }
+  }
+  static float largest(const float *x, int64_t n) {
+    float result = x[0];
+    for (int64_t i = 1; i < n; ++i) result = x[i] > result ? x[i] : result;
+    return result;
+  }
+  static int64_t first_of(float value, const float *x) {
+    int64_t i = 0;
+    while (x[i] != value) ++i;
+    return i;
+  }
+  static double square_of_distance(const double *a, const double *b) {
+    double way2 = 0.0, turn2 = 0.0;
+    for (int i = 0; i < 3; ++i) way2 += (a[i] - b[i]) * (a[i] - b[i]);
+    for (int i = 3; i < 12; ++i) turn2 += (a[i] - b[i]) * (a[i] - b[i]);
+    return way2 + 0.5 * turn2;
+  }
+
+  void put_optima(int64_t row, int64_t i, int64_t n_rows, int64_t n_first) {
+    int64_t *counts = p_.counts + 3 * row, kept = 0;
+    const int64_t to = row * p_.n_kept;
+    counts[1] = counts[2] = 0;
+    for (int64_t k = 0; k < p_.n_starts; ++k) {
+      const int64_t e = place(i, k, n_rows, n_first);
+      counts[1] += !ends_.converged[e];
+      counts[2] += ends_.iterations[e];
+    }
+    while (kept < p_.n_kept) {
+      int64_t best = -1;
+      for (int64_t k = 0; k < p_.n_starts; ++k) {
+        const int64_t e = place(i, k, n_rows, n_first);
+        if (ends_.converged[e] && (best < 0 || ends_.chi2[e] < ends_.chi2[best])) best = e;
+      }
+      if (best < 0 || ends_.chi2[best] > (kept ? p_.chi2[to] : infinity) + p_.keep_within) break;
+      ends_.converged[best] = false;
+      bool same = false;
+      for (int64_t o = to; o < to + kept && !same; ++o)
+        same = square_of_distance(ends_.pose + 12 * best, p_.pose + 12 * o) < same_way2 &&
+               __builtin_fabs(ends_.chi2[best] - p_.chi2[o]) < 1e-3 * (1.0 + p_.chi2[o]);
+      if (same) continue;
+      __builtin_memcpy(p_.pose + 12 * (to + kept), ends_.pose + 12 * best, 12 * sizeof(double));
+      __builtin_memcpy(p_.covariance + 36 * (to + kept), ends_.covariance + 36 * best, 36 * sizeof(double));
+      p_.chi2[to + kept++] = ends_.chi2[best];
+    }
+    counts[0] = kept;
+    for (int64_t o = to + kept; o < to + p_.n_kept; ++o) {
+      for (int a = 0; a < 12; ++a) p_.pose[12 * o + a] = nan;
+      for (int a = 0; a < 36; ++a) p_.covariance[36 * o + a] = nan;
+      p_.chi2[o] = nan;
+    }
+  }
+};
+MAGLOC_END
