@@ -199,7 +199,7 @@ def changed_body(body: MagnetBody, magnets: FloatArray) -> MagnetBody:
     for magnet, turn, change in zip(body.magnets, turns, magnets, strict=True):
         moment = (1.0 + change[STRENGTH]) * (turn @ magnet.moment_Am2)
         rotation = magnet.rotation_xyzw
-        if magnet.shape and (rotation is not None or magnet.shape == "cuboid"):
+        if magnet.shape is not None and (rotation is not None or magnet.shape.kind == "cuboid"):
             own = Rotation.identity() if rotation is None else Rotation.from_quat(rotation)
             rotation = tuple((Rotation.from_matrix(turn) * own).as_quat().tolist())
         position = tuple((np.asarray(magnet.position_m) + change[PLACE]).tolist())

@@ -13,6 +13,7 @@ from magloc.calibration.array import CalibrationPrior
 from magloc.calibration.bodies.calibrate import BodyPrior
 from magloc.calibration.bodies.gauges import body_gauges
 from magloc.calibration.bodies.model import PER_MAGNET, BodyProblem, BodyState, across, changed_body
+from magloc.fields.shapes import Shape
 from sims.magnetics.joystick import nominal_array, nominal_knob, random_poses
 
 N_ROWS = 5
@@ -24,7 +25,7 @@ def problem_and_state(*, known: bool = False, shapes: bool = False) -> tuple[Bod
     rng = np.random.default_rng(3)
     array, body = nominal_array(), nominal_knob()
     if shapes:
-        magnets = [replace(magnet, shape="sphere", size_m=(0.005,)) for magnet in body.magnets]
+        magnets = [replace(magnet, shape=Shape("cylinder", (0.004, 0.006))) for magnet in body.magnets]
         body = replace(body, magnets=tuple(magnets))
     prior = CalibrationPrior(position_m=2e-4, gain=0.03, axes_rad=0.03)
     x, rotation = random_poses(rng, N_ROWS)
