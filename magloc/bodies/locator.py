@@ -1,0 +1,396 @@
+"""Locate a body in single rows of readings: search, uncertainty, limits, and what is wrong where no pose fits."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.bodies.body import MagnetBody
+from magloc.bodies.field import placed_magnets
+from magloc.bodies.fit import linearise, refine_poses
+from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_places
+from magloc.bodies.poses import BodyPoses
+from magloc.bodies.search import (
+    KEEP_WITHIN,
+    N_CANDIDATES,
+    N_STARTS,
+    PoseTable,
+    pose_table,
+    refine_dipoles,
+    search_poses,
+)
+from magloc.bodies.symmetry import BodySymmetry, body_symmetry
+from magloc.chi_square import quantile
+from magloc.levels import CREDIBLE_FIT, MISFIT
+from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.plausibility import warn_of_doubts
+from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, check_magnitudes, check_rows, check_spans, whitened_rows
+from magloc.readings import Readings, as_readings, without_saturated
+
+_LOG = logging.getLogger(__name__)
+_WIDE_RAD = 1.2  # largest rotation beyond which the search has more candidates
+_MORE_CANDIDATES, _MORE_STARTS = 16384, 64
+_ROWS_AT_ONCE = 2048
+_LIMIT_SIGMAS = 3.0
+_OPEN_SIGMA_RAD = np.pi / np.sqrt(3.0)  # of an angle that may be anything
+_ABSENT = 1e-9
+_ROUNDS = 5
+_NO_POSE = "no start leads to a pose that fits"
+
+
+@dataclass(frozen=True, eq=False)
+class BodyLocator:
+    """Locator of one body by one array.
+
+    Parameters
+    ----------
+    array : SensorArray
+    body : MagnetBody
+    find_causes : bool
+        Look for a missing magnet or a faulty sensor where no pose fits.
+
+    Raises
+    ------
+    ValueError
+        The array has one sensor without a prior of the common field, or its numbers are out of range.
+    """
+
+    array: SensorArray
+    body: MagnetBody
+    find_causes: bool = True
+    _tables: dict[tuple[bytes, int], PoseTable] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.array.common_field_T is None:
+            check_spans(self.array)
+        check_magnitudes(self.array)
+        object.__setattr__(self, "symmetry", body_symmetry(self.body))
+        object.__setattr__(self, "_dipoles", self.body.as_dipoles() if self.body.has_shapes else self.body)
+
+    symmetry: BodySymmetry = field(init=False)
+    _dipoles: MagnetBody = field(init=False)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Unknowns of a pose that the field depends on: 6, or 5 for a body with an axis of symmetry."""
+        return 6 if self.symmetry.axis is None else 5
+
+    def fit_rows(
+        self,
+        readings_T: ArrayLike,
+        ambient_T: FloatArray | None = None,
+        *,
+        time_s: FloatArray | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> BodyPoses:
+        """Return the poses of rows of raw readings (n, C) [T], NaN where missing, in ambient fields (n, 3) [T]."""
+        readings = check_rows(self.array, readings_T)
+        parts: list[tuple[IntArray, BodyPoses]] = []
+        for rows in whitened_rows(self.array, readings, ambient_T, _ROWS_AT_ONCE):
+            parts.append((rows.index, self._fit(rows, ambient_T)))
+            if progress is not None:
+                progress(len(rows))
+        width = max((part.chi2.shape[1] for _, part in parts), default=1)
+        poses = BodyPoses.none(len(readings), width, self.symmetry.words)
+        for index, part in parts:
+            poses.put(index, _widened(part, width))
+        return poses if time_s is None else replace(poses, time_s=time_s)
+
+    def _fit(self, rows: WhitenedRows, ambient_T: FloatArray | None) -> BodyPoses:
+        n = len(rows)
+        dof = rows.n_differences - self.n_unknowns
+        if dof < 0:
+            poses = BodyPoses.none(n, 1, self.symmetry.words)
+            reason = (
+                f"{int(rows.mask.sum())} readings give {rows.n_differences} independent differences,"
+                f" {self.n_unknowns} are needed"
+            )
+            return replace(poses, reason=[reason] * n)
+        optima = self._optima(rows, self._dipoles)
+        poses = self._poses(rows, optima, dof)
+        detected = is_detected(rows.energy, rows.n_differences)
+        for i in np.flatnonzero(rows.is_silent | ~detected).tolist():
+            poses.reason[i] = NO_SIGNAL if rows.is_silent[i] else "nothing stands out of the noise"
+            poses.chi2[i] = np.nan
+        if self.find_causes and dof > 0:
+            self._name_causes(rows, poses, ambient_T)
+        return _enlarged(poses)
+
+    def _table(self, rows: WhitenedRows, body: MagnetBody, n: int) -> PoseTable:
+        """Return the table of candidates for the channels of rows; that of the whole body is kept."""
+        if body is not self._dipoles:
+            return pose_table(rows.model, self.array, body, n)
+        key = (rows.mask.tobytes(), n)
+        if key not in self._tables:
+            self._tables[key] = pose_table(rows.model, self.array, body, n)
+        return self._tables[key]
+
+    def _optima(self, rows: WhitenedRows, body: MagnetBody) -> RowOptima:
+        """Return the distinct optima of rows, after a second search for those that no pose fits."""
+        wide = self.body.limits.angle_rad > _WIDE_RAD or not self.body.limits.is_bounded
+        optima = self._search(
+            rows, body, 2 * N_CANDIDATES if wide else N_CANDIDATES, 3 * N_STARTS if wide else N_STARTS
+        )
+        dof = max(rows.n_differences - self.n_unknowns, 1)
+        doubtful = ~(optima.chi2[:, 0] < quantile(dof, 1.0 - CREDIBLE_FIT))
+        if doubtful.any():
+            some = rows.select(doubtful)
+            again = self._search(some, body, _MORE_CANDIDATES, _MORE_STARTS)
+            before = np.nan_to_num(optima.chi2[doubtful, 0], nan=np.inf)
+            better = np.nan_to_num(again.chi2[:, 0], nan=np.inf) < before
+            width = max(again.chi2.shape[1], optima.chi2.shape[1])
+            optima = with_places(optima, width)
+            optima.put(np.flatnonzero(doubtful)[better], RowOptima(*(v[better] for v in vars(again).values())))
+        return optima
+
+    def _search(self, rows: WhitenedRows, body: MagnetBody, n_candidates: int, n_starts: int) -> RowOptima:
+        """Return the distinct optima of rows within Δχ² 20 and within the body's limits, best first."""
+        exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
+        table = self._table(rows, body, n_candidates)
+        keep_within = KEEP_WITHIN if exact else np.inf
+        found = search_poses(rows.model, rows.y, body, table, n_starts=n_starts, keep_within=keep_within)
+        optima = RowOptima(found.position_m, found.R, found.chi2, found.covariance)
+        if body is self._dipoles and not exact:
+            optima = self._settled(rows, optima)
+        position, R, lead = self.symmetry.nearest_to_rest(optima.position_m, optima.R)
+        if self.symmetry.order > 1:
+            optima = RowOptima(position, R, optima.chi2, turned_covariances(optima.covariance, lead))
+        if self.symmetry.axis is not None:
+            optima = replace(optima, covariance=self._with_open_axis(rows, optima, body))
+        return ranked(optima, self.body.radius_m)
+
+    @property
+    def _has_errors(self) -> bool:
+        magnets = self.body.magnets
+        return bool(self.body.moment_root.size) or any(m.position_sigma_m or m.direction_sigma_rad for m in magnets)
+
+    def _settled(self, rows: WhitenedRows, optima: RowOptima) -> RowOptima:
+        """Return optima with exact shapes, the stated errors of the magnets counted as noise."""
+        row, place = np.nonzero(np.isfinite(optima.chi2))
+        if not row.size:
+            return optima
+        some = rows.select(row)
+        position, R = optima.position_m[row, place], optima.R[row, place]
+        settled = RowOptima(*(np.full_like(values, np.nan) for values in vars(optima).values()))
+        for _ in range(_ROUNDS if self._has_errors else 1):  # the columns of the errors follow the pose
+            refined = some
+            if self._has_errors:
+                *_, errors = linearise(some.model, self.body, position, R)
+                refined = some.marginalise(np.nan_to_num(errors))
+            if self.body.has_shapes:
+                fits = refine_poses(refined.model, refined.y, self.body, position, R)
+                _, jacobian, _ = linearise(refined.model, self.body, fits.position_m, fits.R)
+                covariance = inverses(jacobian)
+            else:
+                fits, covariance = refine_dipoles(refined.model, refined.y, self.body, position, R)
+            position, R = fits.position_m, fits.R
+        settled.position_m[row, place], settled.R[row, place] = position, R
+        settled.covariance[row, place] = covariance
+        settled.chi2[row, place] = np.where(fits.converged, fits.chi2, np.nan)
+        return settled
+
+    def _with_open_axis(self, rows: WhitenedRows, optima: RowOptima, body: MagnetBody) -> FloatArray:
+        """Return covariances in which the angle about the body's axis may be anything."""
+        row, place = np.nonzero(np.isfinite(optima.chi2))
+        covariance = optima.covariance.copy()
+        if row.size:
+            model = rows.model.rows(row)
+            _, jacobian, _ = linearise(model, body, optima.position_m[row, place], optima.R[row, place])
+            prior = np.zeros((6, 6))
+            axis = np.asarray(self.symmetry.axis)
+            prior[3:, 3:] = np.outer(axis, axis) / _OPEN_SIGMA_RAD**2
+            covariance[row, place] = np.linalg.inv(jacobian.mT @ jacobian + prior)
+        return covariance
+
+    def _poses(self, rows: WhitenedRows, optima: RowOptima, dof: int) -> BodyPoses:
+        """Return the poses of optima within the body's limits, and the reasons of rows without one."""
+        n = len(rows)
+        within = self._within_limits(optima, dof)
+        best_within, best = (
+            np.nanmin(np.where(mask, optima.chi2, np.inf), axis=1, initial=np.inf)
+            for mask in (within, np.isfinite(optima.chi2))
+        )
+        # A pose beyond the limits that alone explains the readings is the truth, and one within them is none.
+        left = (best_within > quantile(max(dof, 1), 1.0 - CREDIBLE_FIT)) & (best < best_within - KEEP_WITHIN)
+        chosen = ranked(
+            replace(optima, chi2=np.where(within & ~left[:, None], optima.chi2, np.nan)), self.body.radius_m
+        )
+        poses = BodyPoses.none(n, chosen.chi2.shape[1], self.symmetry.words)
+        poses.put(np.arange(n), replace(poses, **vars(chosen), dof=np.full(n, dof)))
+        for i in np.flatnonzero(~np.isfinite(chosen.chi2[:, 0])).tolist():
+            k = int(np.argmin(np.nan_to_num(optima.chi2[i], nan=np.inf)))
+            poses.reason[i] = self._outside(optima.position_m[i, k], optima.R[i, k]) if best[i] < np.inf else _NO_POSE
+        return poses
+
+    def _within_limits(self, optima: RowOptima, dof: int) -> BoolArray:
+        """Return whether optima (b, W) lie within the limits of the body, or three standard deviations beside them."""
+        limits = self.body.limits
+        variance = np.diagonal(optima.covariance, axis1=-2, axis2=-1)
+        factor = np.maximum(np.nan_to_num(optima.chi2) / max(dof, 1), 1.0)[..., None]
+        sigma = np.sqrt(np.nan_to_num(variance, nan=0.0) * factor)
+        beyond_m = np.maximum(limits.low_m - optima.position_m, optima.position_m - np.array(limits.high_m))
+        cosine = 0.5 * (np.trace(optima.R, axis1=-2, axis2=-1) - 1.0)
+        beyond_rad = np.arccos(np.clip(cosine, -1.0, 1.0)) - limits.angle_rad
+        inside = (beyond_m <= _LIMIT_SIGMAS * sigma[..., :3]).all(axis=-1)
+        return inside & (beyond_rad <= _LIMIT_SIGMAS * sigma[..., 3:].max(axis=-1)) & np.isfinite(optima.chi2)
+
+    def _outside(self, position_m: FloatArray, R: FloatArray) -> str:
+        """Return the sentence about a pose beyond the limits."""
+        limits = self.body.limits
+        for axis, x, low, high in zip("xyz", position_m, limits.low_m, limits.high_m, strict=True):
+            if not low <= x <= high:
+                return (
+                    f"the pose that fits lies outside the limits of the body: {axis} = {1e3 * x:.4g} mm, expected"
+                    f" {1e3 * low:g} to {1e3 * high:g} mm"
+                )
+        angle = np.degrees(Rotation.from_matrix(R).magnitude())
+        return (
+            f"the pose that fits lies outside the limits of the body: {angle:.3g}° from rest, expected"
+            f" {np.degrees(limits.angle_rad):.3g}° at most"
+        )
+
+    def _name_causes(self, rows: WhitenedRows, poses: BodyPoses, ambient_T: FloatArray | None) -> None:
+        """Name a missing magnet or a faulty sensor in rows that no pose fits, and take the pose without it."""
+        dof = rows.n_differences - self.n_unknowns
+        worst = np.nan_to_num(poses.chi2[:, 0], nan=np.inf) > quantile(dof, MISFIT)
+        bad = np.flatnonzero(worst & is_detected(rows.energy, rows.n_differences) & ~rows.is_silent)
+        if not bad.size:
+            return
+        some = rows.select(bad)
+        best = np.full(bad.size, quantile(dof, 1.0 - CREDIBLE_FIT))
+        for k, magnet in enumerate(self.body.magnets):
+            optima = self._optima(some, _without(self._dipoles, k))
+            without = self._poses(some, optima, dof)
+            better = np.nan_to_num(without.chi2[:, 0], nan=np.inf) < best
+            self._put_cause(poses, without, bad, better, f"missing {magnet.id}")
+            best[better] = without.chi2[better, 0]
+        locator = replace(self, find_causes=False)
+        for s, sensor in enumerate(self.array.sensors):
+            readings = some.readings_T.copy()
+            readings[:, self.array.channel_sensor == s] = np.nan
+            ambient = None if ambient_T is None else ambient_T[some.index]
+            without = locator.fit_rows(readings, ambient)
+            # Fewer readings fit more easily, so compare probabilities rather than χ².
+            credible = (without.dof > 0) & (
+                without.chi2[:, 0] < np.array([quantile(max(d, 1), 1.0 - CREDIBLE_FIT) for d in without.dof])
+            )
+            better = credible & (best >= quantile(dof, 1.0 - CREDIBLE_FIT))
+            self._put_cause(poses, without, bad, better, f"sensor {sensor.id}")
+            best[better] = 0.0
+
+    def _put_cause(self, poses: BodyPoses, others: BodyPoses, rows: IntArray, better: BoolArray, flag: str) -> None:
+        if not better.any():
+            return
+        width = poses.chi2.shape[1]
+        chosen = np.flatnonzero(better)
+        narrow = _widened(others, width)
+        poses.put(
+            rows[chosen],
+            replace(
+                narrow,
+                position_m=narrow.position_m[chosen],
+                R=narrow.R[chosen],
+                covariance=narrow.covariance[chosen],
+                chi2=narrow.chi2[chosen],
+                dof=narrow.dof[chosen],
+                flags=[(flag,)] * chosen.size,
+                reason=[""] * chosen.size,
+            ),
+        )
+
+
+def _without(body: MagnetBody, index: int) -> MagnetBody:
+    """Return a body whose magnet has lost its moment; without it a body of two would be none."""
+    magnet = body.magnets[index]
+    lost = replace(magnet, moment_Am2=tuple(_ABSENT * np.array(magnet.moment_Am2)))
+    return replace(body, magnets=(*body.magnets[:index], lost, *body.magnets[index + 1 :]))
+
+
+def _widened(poses: BodyPoses, width: int) -> BodyPoses:
+    """Return poses of a given number of places, which may be fewer."""
+    of_places = {name: getattr(poses, name) for name in ("position_m", "R", "covariance", "chi2")}
+    n = min(width, poses.chi2.shape[1])
+    wide: dict[str, Any] = {name: np.full((len(v), width, *v.shape[2:]), np.nan) for name, v in of_places.items()}
+    for name, values in of_places.items():
+        wide[name][:, :n] = values[:, :n]
+    return replace(poses, **wide)
+
+
+def _enlarged(poses: BodyPoses) -> BodyPoses:
+    """Return poses with flags of doubtful covariances, which are enlarged where χ² is far beyond noise."""
+    limits = np.array([quantile(max(int(d), 1), MISFIT) for d in poses.dof])
+    for i in np.flatnonzero(poses.solved).tolist():
+        flags = list(poses.flags[i])
+        if not np.isfinite(poses.covariance[i, 0]).all():
+            flags.append("unknown")
+        if poses.dof[i] > 0 and poses.chi2[i, 0] > limits[i]:
+            flags.append("misfit")
+            poses.covariance[i] *= np.maximum(poses.chi2[i] / poses.dof[i], 1.0)[:, None, None]
+        poses.flags[i] = tuple(flags)
+    return poses
+
+
+def locate_body(
+    array: SensorArray,
+    body: MagnetBody,
+    readings: Readings | ArrayLike,
+    *,
+    ambient_T: ArrayLike | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> BodyPoses:
+    """Find the pose of a body of several magnets in every row of readings, each row independent of the others.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Array with the positions, noise and calibration of its sensors.
+    body : MagnetBody
+        Body with its magnets and the limits of its pose.
+    readings : Readings or array_like, shape (n, C) or (C,)
+        Raw readings [T], NaN where missing. The pose of a moving array is not used: poses are in the array's frame.
+    ambient_T : array_like, shape (n, 3) or (3,), optional
+        Ambient field in the array's frame [T], in place of that of the readings or the array.
+    progress : callable, optional
+        Called with the number of rows finished since the last call.
+
+    Returns
+    -------
+    BodyPoses
+        All distinct poses of every row, best first.
+    """
+    measured = as_readings(readings)
+    warn_of_doubts(array, measured)
+    measured = without_saturated(measured, array)
+    ambient = measured.ambient_T
+    if ambient_T is not None:
+        ambient = np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (len(measured), 3))
+    locator = BodyLocator(array, body)
+    poses = locator.fit_rows(measured.values_T, ambient, time_s=measured.time_s, progress=progress)
+    _warn_of_inside(array, body, poses)
+    return poses
+
+
+def _warn_of_inside(array: SensorArray, body: MagnetBody, poses: BodyPoses) -> None:
+    """Warn of poses in which a sensor is as near to a magnet as no magnet can come."""
+    solved = poses.solved
+    if not solved.any():
+        return
+    magnets, _ = placed_magnets(body, poses.position_m[solved, 0], poses.R[solved, 0])
+    apart = np.linalg.norm(magnets[:, :, None] - array.positions, axis=-1)
+    # The strongest magnets have 1.1 MA/m: a sphere of that magnetisation is the smallest that has the moment.
+    smallest_m = np.cbrt(3.0 * np.linalg.norm(body.moments_Am2, axis=1) / (4.0 * np.pi * 1.2e6))
+    inside = apart < smallest_m[:, None]
+    if inside.any():
+        _, k, s = np.argwhere(inside)[0].tolist()
+        _LOG.warning(
+            f"in {int(inside.any(axis=(1, 2)).sum())} of {len(poses)} rows a sensor lies inside a magnet:"
+            f" {array.ids[s]} in {body.ids[k]}; check the positions of magnets and sensors"
+        )

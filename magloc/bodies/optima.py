@@ -1,0 +1,85 @@
+"""Optima of rows: their order, and their covariances in other coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.bodies.search import KEEP_WITHIN
+
+
+@dataclass(frozen=True, eq=False)
+class RowOptima:
+    """Optima of b rows, W places each; χ² is NaN where there is none."""
+
+    position_m: FloatArray
+    R: FloatArray
+    chi2: FloatArray
+    covariance: FloatArray
+
+    def put(self, rows: IntArray | BoolArray, others: RowOptima) -> None:
+        """Write the optima of some rows, of at most as many places."""
+        width = others.chi2.shape[1]
+        for values, of_others in zip(vars(self).values(), vars(others).values(), strict=True):
+            values[rows] = np.nan
+            values[rows, :width] = of_others
+
+
+def with_places(optima: RowOptima, width: int) -> RowOptima:
+    """Return optima with more places."""
+    more = width - optima.chi2.shape[1]
+    return RowOptima(
+        *(np.concatenate([v, np.full((len(v), more, *v.shape[2:]), np.nan)], axis=1) for v in vars(optima).values())
+    )
+
+
+def ranked(optima: RowOptima, length_m: float) -> RowOptima:
+    """Return distinct optima within Δχ² 20 of the best, in order of χ²."""
+    chi2 = np.where(np.isfinite(optima.chi2), optima.chi2, np.inf)
+    order = np.argsort(chi2, axis=1, kind="stable")
+    chi2 = np.take_along_axis(chi2, order, axis=1)
+    position = np.take_along_axis(optima.position_m, order[..., None], axis=1)
+    R = np.take_along_axis(optima.R, order[..., None, None], axis=1)
+    covariance = np.take_along_axis(optima.covariance, order[..., None, None], axis=1)
+    chi2[chi2 > chi2[:, :1] + KEEP_WITHIN] = np.inf
+    for k in range(1, chi2.shape[1]):
+        way = np.linalg.norm(position[:, :k] - position[:, k : k + 1], axis=-1) / length_m
+        turn = np.linalg.norm(R[:, :k] - R[:, k : k + 1], axis=(-2, -1))
+        same = (way + turn < 1e-3) & np.isfinite(chi2[:, :k])
+        chi2[same.any(axis=1), k] = np.inf
+    again = np.argsort(chi2, axis=1, kind="stable")
+    most = max(int(np.isfinite(chi2).sum(axis=1).max(initial=0)), 1)
+    again = again[:, :most]
+    chi2 = np.take_along_axis(chi2, again, axis=1)
+    gone = ~np.isfinite(chi2)
+    result = RowOptima(
+        np.take_along_axis(position, again[..., None], axis=1),
+        np.take_along_axis(R, again[..., None, None], axis=1),
+        np.where(gone, np.nan, chi2),
+        np.take_along_axis(covariance, again[..., None, None], axis=1),
+    )
+    for values in vars(result).values():
+        values[gone] = np.nan
+    return result
+
+
+def turned_covariances(covariance: FloatArray, lead: FloatArray) -> FloatArray:
+    """Return covariances (..., 6, 6) in a body's frame that is rotated by matrices (..., 3, 3)."""
+    change = np.zeros((*lead.shape[:-2], 6, 6))
+    change[..., :3, :3] = np.eye(3)
+    change[..., 3:, 3:] = np.swapaxes(lead, -1, -2)
+    return np.asarray(change @ covariance @ np.swapaxes(change, -1, -2))
+
+
+def inverses(jacobian: FloatArray) -> FloatArray:
+    """Return the inverses (b, 6, 6) of the information of Jacobians (b, C, 6), NaN where it is singular."""
+    information = jacobian.mT @ jacobian
+    scale = 1.0 / np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    system = scale[:, :, None] * information * scale[:, None]
+    valid: BoolArray = np.asarray(np.isfinite(system).all(axis=(1, 2)))
+    valid[valid] = np.linalg.cond(system[valid]) < 1e13
+    inverse = np.full(system.shape, np.nan)
+    inverse[valid] = np.linalg.inv(system[valid])
+    return np.asarray(scale[:, :, None] * inverse * scale[:, None])
