@@ -17,15 +17,23 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.io.errors import check_positive
 from arrays.noise import proportional_noise
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
+from magloc.bodies.locator import BodyLocator
+from magloc.bodies.poses import BodyPoses
 from magloc.calibration import least_squares as body_fit
 from magloc.calibration.array import CalibrationPrior
 from magloc.calibration.bodies.gauges import unobservable_of_body
 from magloc.calibration.bodies.model import DIRECTION, PER_MAGNET, PLACE, STRENGTH, BodyProblem, BodyState, changed_body
 from magloc.calibration.bodies.results import BodyCalibration, PoseErrors
 from magloc.calibration.bodies.tolerances import with_posterior
-from magloc.calibration.continuation import SHARES, apply_calibration, fit_calibration, inflate_noise
+from magloc.calibration.continuation import (
+    SHARES,
+    apply_calibration,
+    fit_calibration,
+    inflate_field_noise,
+    inflate_noise,
+)
 from magloc.calibration.least_squares import CalibrationIterate
 from magloc.calibration.sensors import AXES, GAINS, OFFSET
 from magloc.least_squares import Optimum
@@ -247,14 +255,11 @@ def _check_lengths(problem: BodyProblem) -> None:
     if known.size < 2:
         return
     chosen = known[np.unique(np.linspace(0, known.size - 1, _COMPARED).round().astype(np.intp))]
-    some = _some(problem, np.isin(np.arange(len(problem.has_pose)), chosen))
-    rest = np.tile(_rest_position(problem.array, problem.body), (len(chosen), 1))
-    free = replace(_fixed(some), pose_m=rest, pose_R=np.tile(np.eye(3), (len(chosen), 1, 1)))
-    free = replace(free, pose_sigma=np.full((len(chosen), 2), np.inf))
-    found = body_fit.fit_state(
-        inflate_noise(free, np.zeros(problem.prior.shape), 1.0), _nominal_state(free)
-    ).point.state
-    stated, located = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (some.pose_m, found.position_m))
+    found = _locate(problem, chosen)
+    if found.solved.sum() < 2:
+        return
+    positions = problem.pose_m[chosen[found.solved]], found.position_m[found.solved, 0]
+    stated, located = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in positions)
     if not located / _SCALE <= stated <= located * _SCALE and stated > _STILL * problem.array.circumradius:
         raise ValueError(
             f"Input truth must have positions in metres; instead they extend over {stated:.3g} m, while the readings"
@@ -272,17 +277,34 @@ def _nominal_state(problem: BodyProblem) -> BodyState:
     )
 
 
+def _locate(problem: BodyProblem, rows: IntArray) -> BodyPoses:
+    """Return the poses of some rows with the nominal array and body, without a start."""
+    doubtful = inflate_field_noise(problem, np.zeros(problem.prior.shape))
+    return BodyLocator(doubtful, problem.body, find_causes=False).fit_rows(problem.readings_T[rows])
+
+
 def _start(problem: BodyProblem) -> tuple[BodyProblem, BodyState, BoolArray]:
-    """Return a problem and a state near its optimum, and which rows are kept: those that are not in a wrong optimum."""
+    """Return a problem and a state near its optimum, and which rows are kept.
+
+    A row without a pose is left out, and so is one in a wrong optimum.
+    """
     state = _nominal_state(problem)
-    poses = inflate_noise(_fixed(problem), state.sensors, 1.0)
-    state = body_fit.fit_state(poses, state, tolerance=_ROUGHLY, max_iterations=_ITERATIONS).point.state
+    unknown = np.flatnonzero(~problem.has_pose)
+    solved = np.ones(len(state.R), dtype=np.bool_)
+    if unknown.size:
+        found = _locate(problem, unknown)
+        solved[unknown] = found.solved
+        position, R = state.position_m.copy(), state.R.copy()
+        position[unknown], R[unknown] = found.position_m[:, 0], found.R[:, 0]
+        problem, state = _some(problem, solved), _rows_of(replace(state, position_m=position, R=R), solved)
+        _check_counts(problem)
     for share in SHARES[:2]:
         lenient = inflate_noise(problem, state.sensors, share)
         state = body_fit.fit_state(lenient, state, tolerance=_ROUGHLY, max_iterations=_ITERATIONS).point.state
     chi2 = np.sum(lenient.residuals(lenient.prediction_T(state)) ** 2, axis=1)
-    kept = problem.has_pose | (chi2 <= _BADLY * np.median(chi2))
-    return _some(problem, kept), _rows_of(state, kept), kept
+    fitted = problem.has_pose | (chi2 <= _BADLY * np.median(chi2))
+    solved[solved] = fitted
+    return _some(problem, fitted), _rows_of(state, fitted), solved
 
 
 def _fixed(problem: BodyProblem) -> BodyProblem:

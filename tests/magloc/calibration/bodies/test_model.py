@@ -92,11 +92,8 @@ class TestDerivatives:
 
 class TestChangedBody:
     def test_two_angles_rotate_a_magnet_and_its_shape(self) -> None:
-        body = replace(nominal_knob())
-        magnets = [
-            replace(m, shape="cylinder", size_m=(0.005, 0.0045), rotation_xyzw=(0, 0, 0, 1)) for m in body.magnets
-        ]
-        body = MagnetBody(tuple(magnets))
+        shape = {"shape": Shape("cylinder", (0.005, 0.0045)), "rotation_xyzw": (0, 0, 0, 1)}
+        body = MagnetBody(tuple(replace(magnet, **shape) for magnet in nominal_knob().magnets))
         change = np.zeros((3, PER_MAGNET))
         change[:, 3], change[:, 4:] = 0.02, [0.05, -0.03]
         after = changed_body(body, change)
