@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "Bounds": "magloc.bounds.crlb",
+        "BodyLocator": "magloc.bodies.locator",
         "BodyPrior": "magloc.calibration.bodies.calibrate",
         "Calibration": "magloc.calibration.results",
         "CalibrationPrior": "magloc.calibration.array",
