@@ -113,7 +113,7 @@ def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Fi
     >>> track = magloc.track_sources(board.array, board.readings[:20], sources=1)
     >>> figure = magloc.plots.source_tracks(track.as_result)
     """
-    names = [f"{result.kind} {id}" for id in result.ids] or ["track"]
+    names = [f"source {id}" for id in result.ids] or ["track"]
     return _tracks_figure(dict(zip(names, result.tracks, strict=True)), None, array_m)
 
 

@@ -19,6 +19,7 @@ from arrays.io.errors import check_positive
 from arrays.noise import proportional_noise
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
+from magloc.bodies.field import body_fields
 from magloc.bodies.locator import BodyLocator
 from magloc.bodies.poses import BodyPoses
 from magloc.calibration import least_squares as body_fit
@@ -45,12 +46,13 @@ from magloc.truth import Truth, rows_of_same_time
 FOLDS = 5
 _FEWEST_ROWS = 4 * FOLDS
 _ROUGHLY = 1.0
-_ITERATIONS = 200
+_ITERATIONS = 60
 # Rows whose χ² exceeds the median by this factor after the coarse fits stand in a wrong optimum.
 _BADLY = 20.0
 # Rows whose positions are compared with the stated ones; factor that only another unit explains; extent over the
 # array's radius below which positions have no unit to be seen.
 _COMPARED, _SCALE, _STILL = 60, 20.0, 1e-3
+_FAR_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ def calibrate_body(
         **poses,
     )
     _check_counts(problem)
-    _check_lengths(problem)
+    _check_units(problem)
     problem, start, kept = _start(problem)
     used[np.flatnonzero(used)[~kept]] = False
     weighted, optimum = fit_calibration(problem, _approach(problem, start))
@@ -249,8 +251,18 @@ def _check_counts(problem: BodyProblem) -> None:
         )
 
 
-def _check_lengths(problem: BodyProblem) -> None:
-    """Refuse known positions in another unit of length than metres, by the poses that the nominal body would have."""
+def _check_units(problem: BodyProblem) -> None:
+    """Refuse readings far from those of the nominal body, and known positions in another unit of length than metres."""
+    rest = _rest_position(problem.array, problem.body)
+    expected = problem.array.readings_of(
+        body_fields(problem.body, problem.array.positions, rest[None], np.eye(3)[None])
+    )
+    read, nominal = (float(np.nanmedian(np.abs(each))) for each in (problem.readings_T, expected))
+    if not nominal / _SCALE**2 <= read <= nominal * _SCALE**2:
+        raise ValueError(
+            f"Input readings must be those of the body; instead they are about {read:.3g} T, and the nominal body at"
+            f" rest gives {nominal:.3g} T: another unit, or no body."
+        )
     known = np.flatnonzero(problem.has_pose)
     if known.size < 2:
         return
@@ -262,8 +274,8 @@ def _check_lengths(problem: BodyProblem) -> None:
     stated, located = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in positions)
     if not located / _SCALE <= stated <= located * _SCALE and stated > _STILL * problem.array.circumradius:
         raise ValueError(
-            f"Input truth must have positions in metres; instead they extend over {stated:.3g} m, while the readings"
-            f" show a motion of about {located:.3g} m."
+            f"Input truth must have positions in metres and of these readings; instead they extend over {stated:.3g} m,"
+            f" while the readings show a motion of about {located:.3g} m."
         )
 
 
@@ -296,6 +308,11 @@ def _start(problem: BodyProblem) -> tuple[BodyProblem, BodyState, BoolArray]:
         solved[unknown] = found.solved
         position, R = state.position_m.copy(), state.R.copy()
         position[unknown], R[unknown] = found.position_m[:, 0], found.R[:, 0]
+        if solved.sum() < 0.5 * len(solved):
+            raise ValueError(
+                f"Input readings must be those of the body; instead only {int(solved.sum())} of {len(solved)} rows have"
+                " a pose with the nominal array and body. Check the moments of the magnets and the axes of the sensors."
+            )
         problem, state = _some(problem, solved), _rows_of(replace(state, position_m=position, R=R), solved)
         _check_counts(problem)
     for share in SHARES[:2]:
@@ -368,9 +385,18 @@ def _result(
         estimated=problem.free,
         covariance=covariance,
         unobservable=unobservable_of_body(problem, state, told),
+        far_from_prior=_far_from_prior(problem, state),
         position_m=state.position_m,
         rotation=Rotation.from_matrix(state.R),
     )
+
+
+def _far_from_prior(problem: BodyProblem, state: BodyState) -> tuple[str, ...]:
+    """Return the sensors and magnets with a change beyond five standard deviations of the prior."""
+    sensors = np.where(problem.free, np.abs(state.sensors) / problem.prior, 0.0).max(axis=1) > _FAR_SIGMAS
+    magnets = (np.abs(state.magnets) / problem.magnet_prior).max(axis=1) > _FAR_SIGMAS
+    named = [*(f"sensor {name}" for name in problem.array.ids), *(f"magnet {name}" for name in problem.body.ids)]
+    return tuple(name for name, far in zip(named, [*sensors.tolist(), *magnets.tolist()], strict=True) if far)
 
 
 def _leave_rows_out(problem: BodyProblem, start: BodyState) -> PoseErrors | None:

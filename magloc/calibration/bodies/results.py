@@ -71,6 +71,8 @@ class BodyCalibration(Calibration):
         Posterior covariance of ``change[estimated]`` and `magnet_change`.
     position_m, rotation : ndarray, shape (T, 3), Rotation of T
         Poses of the body in the array's frame, in the rows that were used.
+    far_from_prior : tuple of str
+        Sensors and magnets whose change is beyond five standard deviations of the prior: dead, exchanged, or reversed.
     cross_validation : PoseErrors, optional
         How well the calibration carries over to other rows; None where rows are too few.
     """
@@ -88,6 +90,7 @@ class BodyCalibration(Calibration):
     covariance: FloatArray
     position_m: FloatArray
     rotation: Rotation
+    far_from_prior: tuple[str, ...]
     cross_validation: PoseErrors | None = None
 
     @property

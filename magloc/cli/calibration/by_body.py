@@ -152,6 +152,7 @@ def _report(result: BodyCalibration, n_rows: int, out: Path | None, out_body: Pa
         "sensors": sensor_entries(result),
         "magnets": magnets,
         "unobservable": unobservable_entries(result),
+        "far_from_prior": result.far_from_prior,
         "cross_validation": None if result.cross_validation is None else result.cross_validation.json,
     }
 
@@ -185,6 +186,9 @@ def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
         notes.append(f"not determined by the readings, kept as in the files: {names}")
     if result.cross_validation is not None:
         notes.append(_validation_note(result.cross_validation))
+    if result.far_from_prior:
+        names = ", ".join(result.far_from_prior)
+        notes.append(f"warning: changes far beyond the stated tolerances, dead, exchanged or reversed: {names}")
     excess = result.chi2 / max(1.0, result.dof)
     if excess > _EXCESS:
         notes.append(

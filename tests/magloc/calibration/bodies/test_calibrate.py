@@ -174,6 +174,19 @@ class TestRefusals:
         with pytest.raises(ValueError, match="truth must have positions in metres"):
             one.calibrate(truth=replace(truth, position_m=1e3 * truth.position_m))
 
+    def test_readings_in_nanotesla(self) -> None:
+        one = case(1, 30)
+        wrong = replace(one.readings, values_T=1e9 * one.readings.values_T)
+        with pytest.raises(ValueError, match="another unit, or no body"):
+            calibrate_body(nominal_array(), nominal_knob(), wrong, truth=one.truth())
+
+    def test_a_reversed_magnet_leaves_hardly_any_pose(self) -> None:
+        one = case(1, 200)
+        first, *others = nominal_knob().magnets
+        turned = replace(first, moment_Am2=tuple((-np.array(first.moment_Am2)).tolist()))
+        with pytest.raises(ValueError, match="of 200 rows have a pose with the nominal array and body"):
+            calibrate_body(nominal_array(), replace(nominal_knob(), magnets=(turned, *others)), one.readings)
+
     def test_truth_of_another_time(self) -> None:
         one = case(1, 30)
         truth = one.truth()
@@ -194,6 +207,17 @@ class TestRefusals:
     def test_a_prior_that_is_not_positive(self) -> None:
         with pytest.raises(ValueError, match="strength must be positive"):
             BodyPrior(strength=0.0)
+
+
+def test_a_dead_sensor_is_named() -> None:
+    """Gains of zero explain its readings, far beyond their tolerance."""
+    one = case(17, 80)
+    values_T = one.readings.values_T.copy()
+    values_T[:, 3:6] = 0.0
+    dead = replace(one.readings, values_T=values_T)
+    result = calibrate_body(nominal_array(), nominal_knob(), dead, truth=one.truth(), validate=False)
+    assert "sensor s2" in result.far_from_prior
+    assert one.calibrate(truth=one.truth(), validate=False).far_from_prior == ()
 
 
 def test_calibrated_files_state_what_is_left() -> None:
