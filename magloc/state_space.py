@@ -197,6 +197,27 @@ def iterated_update(
     return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
 
 
+def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
+    """Return F[0, 1] and F[1, 1] of (value, rate), and the root (2, 2) of its noise for σ = 1."""
+    if dt_s == 0.0:
+        return 0.0, 1.0, np.zeros((2, 2))
+    if dt_s > correlation_s:
+        # Van Loan's exponential grows with exp(Δt/τ) and loses Q over long gaps; the closed form cancels in short ones.
+        decay = math.exp(-dt_s / correlation_s)
+        Q_vv, Q_pv = 1.0 - decay**2, correlation_s * (1.0 - decay) ** 2
+        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * decay - decay**2)
+        root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
+        return correlation_s * (1.0 - decay), decay, root
+    from filterpy.common import van_loan_discretization  # it brings matplotlib and scipy.stats
+
+    drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
+    F, Q = van_loan_discretization(drift, np.array([[0.0], [1.0]]), dt_s)
+    # The value's own noise grows with Δt³: the factorisation must not see it cancel.
+    scale = np.sqrt(np.diagonal(Q))
+    root = math.sqrt(2.0 / correlation_s) * scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
+    return float(F[0, 1]), float(F[1, 1]), root
+
+
 def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[FloatArray, FloatArray]:
     r"""Return the gain G of a fixed-interval smoother over one step, and a root D of the remaining covariance.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -42,6 +43,7 @@ _ROWS_AT_ONCE = 2048
 _LIMIT_SIGMAS = 3.0
 _OPEN_SIGMA_RAD = np.pi / np.sqrt(3.0)  # of an angle that may be anything
 _ABSENT = 1e-9
+_LARGEST_BEND = 0.3  # beyond it the mean NEES of simulated rows is 2
 _ROUNDS = 5
 _NO_POSE = "no start leads to a pose that fits"
 
@@ -66,12 +68,13 @@ class BodyLocator:
     array: SensorArray
     body: MagnetBody
     find_causes: bool = True
-    _tables: dict[tuple[bytes, int], PoseTable] = field(default_factory=dict)
+    _tables: dict[tuple[bytes, int, MagnetBody], PoseTable] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.array.common_field_T is None:
             check_spans(self.array)
         check_magnitudes(self.array)
+        object.__setattr__(self, "array", with_offsets_as_noise(self.array))
         object.__setattr__(self, "symmetry", body_symmetry(self.body))
         object.__setattr__(self, "_dipoles", self.body.as_dipoles() if self.body.has_shapes else self.body)
 
@@ -122,13 +125,22 @@ class BodyLocator:
             poses.chi2[i] = np.nan
         if self.find_causes and dof > 0:
             self._name_causes(rows, poses, ambient_T)
-        return _enlarged(poses)
+        poses = _enlarged(poses)
+        for i in np.flatnonzero(self._bends(rows, poses) > _LARGEST_BEND).tolist():
+            poses.flags[i] = (*poses.flags[i], "bent")
+        return poses
+
+    def _bends(self, rows: WhitenedRows, poses: BodyPoses) -> FloatArray:
+        """Return how far readings bend over one standard deviation of the best poses (n,), in units of the noise."""
+        magnets, _ = placed_magnets(self.body, poses.position_m[:, 0], poses.R[:, 0])
+        square_m = np.sum((magnets[:, :, None] - self.array.positions) ** 2, axis=-1).min(axis=(1, 2))
+        variance = np.diagonal(poses.covariance[:, 0], axis1=1, axis2=2)
+        spread = 6.0 * variance[:, :3].sum(axis=1) / square_m + 0.5 * variance[:, 3:].sum(axis=1)
+        return np.asarray(spread * np.sqrt(np.vecdot(rows.y, rows.y) / rows.y.shape[1]))
 
     def _table(self, rows: WhitenedRows, body: MagnetBody, n: int) -> PoseTable:
-        """Return the table of candidates for the channels of rows; that of the whole body is kept."""
-        if body is not self._dipoles:
-            return pose_table(rows.model, self.array, body, n)
-        key = (rows.mask.tobytes(), n)
+        """Return the table of candidates for the channels of rows, which is kept."""
+        key = (rows.mask.tobytes(), n, body)
         if key not in self._tables:
             self._tables[key] = pose_table(rows.model, self.array, body, n)
         return self._tables[key]
@@ -160,8 +172,8 @@ class BodyLocator:
         optima = RowOptima(found.position_m, found.R, found.chi2, found.covariance)
         if body is self._dipoles and not exact:
             optima = self._settled(rows, optima)
-        position, R, lead = self.symmetry.nearest_to_rest(optima.position_m, optima.R)
         if self.symmetry.order > 1:
+            position, R, lead = self.symmetry.nearest_to_rest(optima.position_m, optima.R)
             optima = RowOptima(position, R, optima.chi2, turned_covariances(optima.covariance, lead))
         if self.symmetry.axis is not None:
             optima = replace(optima, covariance=self._with_open_axis(rows, optima, body))
@@ -220,11 +232,19 @@ class BodyLocator:
         )
         # A pose beyond the limits that alone explains the readings is the truth, and one within them is none.
         left = (best_within > quantile(max(dof, 1), 1.0 - CREDIBLE_FIT)) & (best < best_within - KEEP_WITHIN)
-        chosen = ranked(
-            replace(optima, chi2=np.where(within & ~left[:, None], optima.chi2, np.nan)), self.body.radius_m
+        kept = within & ~left[:, None]
+        chosen = optima
+        if (kept != np.isfinite(optima.chi2)).any():
+            chosen = ranked(replace(optima, chi2=np.where(kept, optima.chi2, np.nan)), self.body.radius_m)
+        of_rows: tuple[list[tuple[str, ...]], list[str]] = [()] * n, [""] * n
+        poses = BodyPoses(
+            np.arange(n, dtype=np.float64),
+            **vars(chosen),
+            dof=np.full(n, dof, dtype=np.intp),
+            flags=of_rows[0],
+            reason=of_rows[1],
+            symmetry=self.symmetry.words,
         )
-        poses = BodyPoses.none(n, chosen.chi2.shape[1], self.symmetry.words)
-        poses.put(np.arange(n), replace(poses, **vars(chosen), dof=np.full(n, dof)))
         for i in np.flatnonzero(~np.isfinite(chosen.chi2[:, 0])).tolist():
             k = int(np.argmin(np.nan_to_num(optima.chi2[i], nan=np.inf)))
             poses.reason[i] = self._outside(optima.position_m[i, k], optima.R[i, k]) if best[i] < np.inf else _NO_POSE
@@ -305,6 +325,15 @@ class BodyLocator:
                 reason=[""] * chosen.size,
             ),
         )
+
+
+def with_offsets_as_noise(array: SensorArray) -> SensorArray:
+    """Return the array with errors of the offsets as noise of a single row."""
+    sensors = tuple(
+        replace(sensor, noise_T=math.hypot(sensor.noise_T, sensor.offset_uncertainty_T), offset_uncertainty_T=0.0)
+        for sensor in array.sensors
+    )
+    return replace(array, sensors=sensors)
 
 
 def _without(body: MagnetBody, index: int) -> MagnetBody:

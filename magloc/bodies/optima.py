@@ -37,6 +37,8 @@ def with_places(optima: RowOptima, width: int) -> RowOptima:
 
 def ranked(optima: RowOptima, length_m: float) -> RowOptima:
     """Return distinct optima within Δχ² 20 of the best, in order of χ²."""
+    if optima.chi2.shape[1] == 1:
+        return optima
     chi2 = np.where(np.isfinite(optima.chi2), optima.chi2, np.inf)
     order = np.argsort(chi2, axis=1, kind="stable")
     chi2 = np.take_along_axis(chi2, order, axis=1)

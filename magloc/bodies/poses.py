@@ -16,9 +16,8 @@ FLAGS = {
     "missing": "this magnet gives no field: the readings agree with the body without it",
     "sensor": "this sensor contradicts all others and is not used",
     "misfit": "χ² is far beyond noise; standard deviations are enlarged by √(χ²/dof)",
+    "bent": "the likelihood is not Gaussian: errors may be larger than the covariance says",
     "unknown": "the readings leave a rotation or a translation open",
-    "others": "other poses fit almost as well, see --json",
-    "left": "the pose has left the limits of the body",
 }
 """Flags of a pose, and what they mean."""
 

@@ -144,10 +144,10 @@ def _covariances(model: WhitenedModel, covariance: FloatArray, R: FloatArray) ->
     return np.asarray(change @ covariance @ np.swapaxes(change, -1, -2))
 
 
-def _fit_problem(
-    model: WhitenedModel, y: FloatArray, body: MagnetBody, row: IntArray, max_iterations: int, **results: object
+def fit_problem(
+    model: WhitenedModel, signals: FloatArray, body: MagnetBody, row: IntArray, max_iterations: int, **results: object
 ) -> core.Problem:
-    """Return the fits of poses for the kernels."""
+    """Return the fits of poses for the kernels; `signals` are of :func:`magloc.measurement.channels.signals_of`."""
     of_results = dict.fromkeys(("start", "pose", "chi2", "covariance", "iterations", "converged")) | results
     return core.problem(
         "pose_refinement",
@@ -158,7 +158,7 @@ def _fit_problem(
         relative_tolerance=RELATIVE_TOLERANCE,
         places=np.ascontiguousarray(body.positions_m / model.radius),
         moments=np.ascontiguousarray(body.moments_Am2 * (MU0_OVER_4PI / model.radius**3)),
-        signals=signals_of(model, y),
+        signals=signals,
         row=row,
         **of_results,
     )
@@ -180,7 +180,7 @@ def refine_dipoles(
     start = packed(model, position_m, R)
     results: dict[str, object] = {"start": start, "pose": pose, "chi2": chi2, "covariance": covariance}
     results |= {"iterations": iterations, "converged": converged}
-    work = _fit_problem(model, y, body, np.arange(n), max_iterations, **results)
+    work = fit_problem(model, signals_of(model, y), body, np.arange(n), max_iterations, **results)
     core.run("refine_poses", work, n, block=_ROWS_A_BLOCK)
     position, rotation = unpacked(model, pose)
     fits = PoseFits(position, rotation, np.where(converged, chi2, np.inf), iterations.astype(np.intp))
@@ -203,7 +203,7 @@ def search_poses(
     covariance, counts = np.empty((n, N_KEPT, 6, 6)), np.empty((n, 3), np.int64)
     work = core.problem(
         "pose_search",
-        fit=_fit_problem(model, y, body, np.arange(n), max_iterations),
+        fit=fit_problem(model, signals_of(model, y), body, np.arange(n), max_iterations),
         n_candidates=len(table.candidates),
         n_features=len(table.table),
         n_starts=n_starts,

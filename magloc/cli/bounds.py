@@ -64,6 +64,9 @@ class SourceOptions:
     body_length_m : float
         Length of the source [m]. The part of its field that a dipole does not describe counts as noise. By default a
         quarter of its distance, if four sensors are nearer than 0.6 of the array's circumradius. 0 for a point source.
+    body : Path
+        Body file (TOML) of a rigid body of two or more magnets: bounds of its pose over the limits of the file; needs
+        --array, and no maps are written.
     """
 
     array: Path | None = None
@@ -72,6 +75,7 @@ class SourceOptions:
     ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0
     known_moment_sigma_Am2: Annotated[float | None, Parameter(name="--known-moment-sigma-Am2")] = None
     body_length_m: float | None = None
+    body: Path | None = None
 
 
 @Parameter(name="*", group="Required accuracy, and extent of the maps")
@@ -157,6 +161,14 @@ def bounds(
     from magloc.fields.multipole import assumed_body_lengths
     from magloc.measurement.rows import check_magnitudes
 
+    if of.body is not None:
+        from magloc.cli.moments.body_poses import bounds_with_body, refuse_with_body
+
+        refuse_with_body({"--position": of.position, "--moment-Am2": of.moment_Am2, "--out": out, "--gif": gif})
+        if of.array is None:
+            raise InputError("--body: found no --array, expected the array file.")
+        bounds_with_body(of.array, of.body, as_json=json)
+        return
     source = read_starts_scenario(scenario)
     array = source.array if of.array is None else _array_of(of.array)
     with naming(scenario if of.array is None else str(of.array)):

@@ -90,6 +90,7 @@ def live(
     rest_s: float = 0.0,
     replay_speed: float = 1.0,
     out: Path | None = None,
+    body: Path | None = None,
     turning: TurningOptions = TurningOptions(),
     page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
@@ -117,6 +118,8 @@ def live(
     out : Path, optional
         CSV file to write, with the columns of track.csv of magloc track --out: a row for every line and source, as soon
         as it is known.
+    body : Path, optional
+        Body file (TOML) of a rigid body of two or more magnets; its pose is tracked, in the array's frame.
     turning : TurningOptions
         Calibration in place of tracking.
     page : PageOptions
@@ -140,6 +143,13 @@ def live(
 
         with naming_place(), naming(str(array), readings=source, time_s=source):
             calibrate_live(used, array, source, replay_speed, turning, known.where, page)
+        return
+    if body is not None:
+        from magloc.cli.moments.body_poses import follow_with_body, refuse_with_body
+
+        refuse_with_body({"--out": out, "--rest-s": rest_s or None, "--view": page.view})
+        with naming_place(), naming(str(array), readings=source, time_s=source):
+            follow_with_body(used, body, source, motion, known, replay_speed)
         return
     with naming(str(array), sources=f"--sources {motion.sources}"):
         follower = motion.follower(used, known, known.where, rest_s)

@@ -48,6 +48,8 @@ class FixOptions:
         of the array's circumradius. 0 for a point source.
     keep_sensors : bool
         Use all sensors, even those that contradict the others.
+    body : Path
+        Body file (TOML) of a rigid body of two or more magnets; its pose is estimated, in the array's frame.
     """
 
     sources: str | None = None
@@ -56,6 +58,7 @@ class FixOptions:
     ambient_gradient: Flag = False
     body_length_m: float | None = None
     keep_sensors: Flag = False
+    body: Path | None = None
 
     @property
     def n_sources(self) -> int | Literal["auto"]:
@@ -113,6 +116,14 @@ def locate(
 
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
     length_m, position = wanted.body_length_m, wanted.position
+    if wanted.body is not None:
+        from magloc.cli.moments.body_poses import locate_with_body, refuse_with_body
+
+        single = {"--sources": wanted.sources, "--position": position, "--body-length-m": length_m, "--truth": truth}
+        refuse_with_body(single | {"--average": wanted.average, "--ambient-gradient": wanted.ambient_gradient})
+        refuse_file(out, "--out")
+        locate_with_body(readings, array, wanted.body, known, as_json=json, out=out)
+        return
     joint = wanted.sources is not None or (position is not None and len(position) > 1)
     refuse_outside(0.0, LARGEST, "a length, or 0 for a point", body_length_m=length_m)
     if position is not None and (wanted.sources is not None or known.region is not None):

@@ -77,11 +77,15 @@ class PathOptions(MotionOptions):
         results. Only the moment is estimated; it turns with the attitude. Rows outside the path are left out.
     error : PathErrorOptions
         Errors of a known path.
+    body : Path
+        Body file (TOML) of a rigid body of two or more magnets; its pose is tracked, in the array's frame. Typical
+        speed, rotation rate and correlation time are 0.1 m/s, 115°/s and 0.2 s by default.
     """
 
     position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
+    body: Path | None = None
 
     def known_path(self) -> ObjectPath | list[Vector] | None:
         """Return the known path or positions; None if the position is to be estimated."""
@@ -202,6 +206,13 @@ def track(
         raise InputError("--json: found together with --jsonl, expected one of them.")
     refuse_file(out, "--out")
     refuse_one_for_two({"--out": out, **maps.outputs})
+    if motion.body is not None:
+        from magloc.cli.moments.body_poses import refuse_with_body, track_with_body
+
+        single = {"--smooth": smooth, "--truth": truth, "--position": motion.position, **maps.outputs}
+        refuse_with_body(single | {"--object-path": motion.object_path})
+        track_with_body(readings, array, motion.body, known, motion, conditioning, as_json=json, jsonl=jsonl, out=out)
+        return
     maps.refuse(known.place)
     outputs = TrackOutputs(json, jsonl, maps, out, truth)
     # A place without a date is for the maps only.

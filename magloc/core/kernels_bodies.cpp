@@ -1,5 +1,5 @@
 // Poses of rigid bodies of several magnets.
-#include "magloc/body.hpp"
+#include "magloc/pose_track.hpp"
 
 MAGLOC_BEGIN
 template <class Channels>
@@ -22,6 +22,15 @@ int64_t search_poses(const magloc_pose_search &p, int64_t begin, int64_t end, do
     search.run(i, end - i < search.rows_together ? end - i : search.rows_together);
   return 0;
 }
+
+template <class Channels>
+int64_t follow_body(const magloc_pose_track &p, int64_t begin, int64_t end, double *workspace) {
+  Workspace room(workspace);
+  BodyFilter<Channels> filter(p, room);
+  if (!workspace) return room.size();
+  for (int64_t i = begin; i < end; ++i) filter.follow(i);
+  return 0;
+}
 MAGLOC_END
 
 using namespace magloc;
@@ -34,4 +43,9 @@ MAGLOC_KERNEL(refine_poses, pose_refinement) {
 MAGLOC_KERNEL(search_poses, pose_search) {
   if (problem->fit->channels->is_modulus) return search_poses<Moduli<Lanes>>(*problem, begin, end, workspace);
   return search_poses<General<Lanes>>(*problem, begin, end, workspace);
+}
+
+MAGLOC_KERNEL(follow_body, pose_track) {
+  if (problem->fit->channels->is_modulus) return follow_body<Moduli<double>>(*problem, begin, end, workspace);
+  return follow_body<General<double>>(*problem, begin, end, workspace);
 }

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
+    from magloc.bodies.poses import BodyPoses
+
 
 def write_track_figures(
     points: Sequence[TrackPoint],
@@ -232,6 +234,24 @@ def consistency_figure(
         style.shade_gaps(ax, time, tracked, "not tracked")
         if ax is not axes[-1]:
             ax.set_xlabel("")
+    return figure
+
+
+def plot_poses(poses: BodyPoses) -> Figure:
+    """Draw position and rotation vector of a body over time, with their 95 % bands."""
+    figure = style.new_figure(5.2)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    sigma = np.sqrt(np.diagonal(poses.covariance[:, 0], axis1=1, axis2=2))
+    turn = np.where(poses.solved[:, None], poses.rotation.as_rotvec(), np.nan)
+    for i, (axis, colour, *_) in enumerate(style.COMPONENTS):
+        _draw_band(upper, poses.time_s, 1e3 * poses.position_m[:, 0, i], 1e3 * sigma[:, i], axis, colour)
+        _draw_band(lower, poses.time_s, np.degrees(turn[:, i]), np.degrees(sigma[:, 3 + i]), axis, colour)
+    for ax, name in ((upper, "position [mm]"), (lower, "rotation vector [°]")):
+        style.shade_gaps(ax, poses.time_s, poses.solved, "no pose")
+        style.label_axes(ax, "time [s]", name)
+    handles, labels = upper.get_legend_handles_labels()
+    entries = dict(zip(labels, handles, strict=True))
+    figure.legend(entries.values(), entries.keys(), loc="outside upper center", ncols=len(entries))
     return figure
 
 

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from arrays.typing import FloatArray, Vector
 from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_change
+from magloc.state_space import ornstein_uhlenbeck_step
 
 N_SOURCE = 6
 _AT_REST: Vector = (0.0, 0.0, 0.0)
@@ -309,27 +310,6 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
 
 
 @lru_cache(maxsize=64)
-def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
-    """Return F[0, 1] and F[1, 1] of (value, rate), and the root (2, 2) of its noise for σ = 1."""
-    if dt_s == 0.0:
-        return 0.0, 1.0, np.zeros((2, 2))
-    if dt_s > correlation_s:
-        # Van Loan's exponential grows with exp(Δt/τ) and loses Q over long gaps; the closed form cancels in short ones.
-        decay = math.exp(-dt_s / correlation_s)
-        Q_vv, Q_pv = 1.0 - decay**2, correlation_s * (1.0 - decay) ** 2
-        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * decay - decay**2)
-        root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
-        return correlation_s * (1.0 - decay), decay, root
-    from filterpy.common import van_loan_discretization  # it brings matplotlib and scipy.stats
-
-    drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
-    F, Q = van_loan_discretization(drift, np.array([[0.0], [1.0]]), dt_s)
-    # The value's own noise grows with Δt³: the factorisation must not see it cancel.
-    scale = np.sqrt(np.diagonal(Q))
-    root = math.sqrt(2.0 / correlation_s) * scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
-    return float(F[0, 1]), float(F[1, 1]), root
-
-
 def turning_step(velocity: tuple[float, float], rate: tuple[float, float], dt_s: float) -> list[float]:
     """Return ten numbers of a step for the C++ kernel, by correlation time and σ of velocity and rate of turn."""
     (gain_s, decay, root_v), (turn_gain_s, turn_decay, root_w) = (

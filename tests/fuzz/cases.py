@@ -17,12 +17,14 @@ import arrays
 from adcs.cli.app import app as adcs_app
 from adcs.cli.app import main as adcs_main
 from arrays.io.csv import write_columns
+from magloc.bodies.body_file import write_body
 from magloc.cli.app import app as magloc_app
 from magloc.cli.app import main as magloc_main
 from magloc.measurement.differences import predicted_channels
-from magloc.readings import write_readings
+from magloc.readings import Readings, write_readings
 from sims.experiments.loads import switching_loads
 from tests.adcs.stars.test_identification import random_sky, write_frames
+from tests.magloc.bodies.devices import hall_ring, knob, random_poses, readings_of
 from tests.magloc.compensation.flights import Flight, Platform, array_of
 from tests.magloc.live.test_turning import board as turned_board
 from tests.magloc.live.test_turning import turned as turned_rows
@@ -62,6 +64,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "readings.csv --array array.toml --average",
         "scalar.csv --array scalar.toml --json",
         "moving.csv --array moving-array.toml",
+        "body.csv --array body-array.toml --body body.toml --json",
     ),
     "magloc track": (
         "readings.csv --array array.toml --json",
@@ -71,12 +74,14 @@ LINES: dict[str, tuple[str, ...]] = {
         "readings.csv --array array.toml --sources 1 --out out",
         "passing.csv --array passing-array.toml --object-path passing-path.csv --path-sigma-m 1 --smooth --json",
         "readings.csv --array array.toml --position 3 0.5 0.306 --truth readings-truth.csv",
+        "body.csv --array body-array.toml --body body.toml --out out",
     ),
     "magloc live": (
         "--array array.toml --from - --speed-m-s 0.1",
         "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3 --out out.csv",
         "--array log.toml --from replay:log.csv --replay-speed 1e6",
         "--array turned.toml --from replay:turned.csv --replay-speed 1e6 --calibrate --out-array out.toml",
+        "--array body-array.toml --body body.toml --from replay:body.csv --replay-speed 1e6",
     ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
@@ -88,7 +93,11 @@ LINES: dict[str, tuple[str, ...]] = {
         "map.toml --method iekf --grid 3 --out out",
         "map.toml --over sources --grid 3 --body-length-m 0.1 --out out --json",
     ),
-    "magloc bounds": ("map.toml --grid 3 --moments 4 --out out --json", "--array array.toml --grid 3 --moments 4"),
+    "magloc bounds": (
+        "map.toml --grid 3 --moments 4 --out out --json",
+        "--array array.toml --grid 3 --moments 4",
+        "--array body-array.toml --body body.toml --json",
+    ),
     "magloc design": ("task.toml --out out.toml --json",),
     "magloc view": (
         "array.toml --html out.html",
@@ -356,6 +365,7 @@ def write_files(folder: Path) -> None:
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
     _write_flight(folder)
+    _write_body(folder)
     board = turned_board()
     arrays.write_array(folder / "turned.toml", board)
     write_readings(folder / "turned.csv", turned_rows(250), board)
@@ -371,6 +381,16 @@ def _write_log(folder: Path) -> None:
     (folder / "log.csv").write_text(text.replace(",", ";").replace(".", ",").replace("time_s", "T"))
     columns = '\n[columns]\nseparator = "semicolon"\ndecimal = ","\ntime = "T"\nunit = "uT"\n'
     (folder / "log.toml").write_text((folder / "array.toml").read_text() + columns)
+
+
+def _write_body(folder: Path) -> None:
+    """Readings of a knob with three magnets over three sensors, with the files of both."""
+    array, body = hall_ring(), knob()
+    rng = np.random.default_rng(0)
+    values_T = readings_of(array, body, *random_poses(body, 10, rng), rng)
+    arrays.write_array(folder / "body-array.toml", array)
+    write_body(folder / "body.toml", body)
+    write_readings(folder / "body.csv", Readings(values_T, time_s=0.1 * np.arange(10)), array)
 
 
 def _write_magarrow(folder: Path) -> None:

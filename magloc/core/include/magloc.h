@@ -390,6 +390,29 @@ typedef struct {
 } magloc_pose_search;
 int64_t magloc_search_poses(const magloc_pose_search *problem, int64_t begin, int64_t end, double *workspace);
 
+/* A body followed by one Gaussian over rows, each with a set of channels of its own or one for all; an item is a row.
+   States are the pose (position, then a small rotation in the body's frame), errors of the magnets and of the sensors,
+   and the rates: velocity in the array's frame, rotation rate in the body's. Positions are in radii. */
+typedef struct {
+  const magloc_pose_refinement *fit; /* channels, magnets, signals and row; starts and results are not used */
+  int64_t n_magnet_errors, n_sensor_errors, max_iterations, most_contradictions;
+  double tolerance;                        /* square of a step, in its standard deviations, that ends an iteration */
+  const double *magnet_errors;             /* (n_magnets, n_magnet_errors) relative change of each moment */
+  const double *sensor_errors;             /* (n_rows, n_sensor_errors, n_channels) whitened readings, or NULL */
+  const double *lasting, *added;           /* (n_rows, n_sensor_errors) share that lasts, and noise, of a step */
+  const double *steps;                     /* (n_rows, 2, 5) of position and rotation: time that the rate lasts, share
+                                              that is left of it, and lower roots (00, 10, 11) of the noise */
+  const double *nis_limits;                /* (n_rows) above which a row contradicts the track */
+  const double *curvature;                 /* (n_rows) weight of what the linearisation leaves out, in the noise */
+  double *pose, *rates, *errors;           /* (12), (6), (errors): the state before the next row, changed by calls, */
+  double *covariance;                      /* (n, n) */
+  int64_t *progress;                       /* (2) contradictions in succession, and 1 as long as the track continues */
+  double *poses, *all_rates, *covariances; /* (n_rows, 12), (n_rows, 6) and (n_rows, 12, 12) of pose and rates */
+  double *nis;                             /* (n_rows) */
+  int64_t *status;                         /* (n_rows) 1 updated, 2 contradiction, 0 after the end of the track */
+} magloc_pose_track;
+int64_t magloc_follow_body(const magloc_pose_track *problem, int64_t begin, int64_t end, double *workspace);
+
 /* Orthonormal readings of the three unit moments at candidate positions, by channels of one set; an item is a
    candidate. */
 typedef struct {

@@ -38,7 +38,7 @@ def test_errors_are_those_that_are_stated() -> None:
     position_m, R = random_poses(body, 400, rng)
     poses = locate_body(array, body, readings_of(array, body, position_m, R, rng))
     assert poses.solved.all()
-    assert not any(poses.flags)
+    assert not any({"misfit", "unknown"} & set(flags) for flags in poses.flags)
     assert nees(poses, position_m, R).mean() == pytest.approx(1.0, abs=0.1)
 
 
@@ -91,6 +91,17 @@ def test_shapes_are_exact_where_dipoles_are_wrong() -> None:
     assert sum(bool(flags or reason) for flags, reason in zip(point.flags, point.reason, strict=True)) > 50
 
 
+def test_rows_of_three_sensors_are_consistent_or_flagged() -> None:
+    # 500 rows: the mean of their NEES has a standard deviation of 0.03.
+    rng = np.random.default_rng(60_17)
+    array, body = hall_ring(3), knob()
+    position_m, R = random_poses(body, 600, rng)
+    poses = locate_body(array, body, readings_of(array, body, position_m, R, rng))
+    plain = np.array([not flags for flags in poses.flags]) & (poses.n_poses == 1)
+    assert plain.mean() > 0.75
+    assert nees(poses, position_m, R)[plain].mean() == pytest.approx(1.0, abs=0.12)
+
+
 class TestCauses:
     array = hall_ring(5)
     rng = np.random.default_rng(60_14)
@@ -99,14 +110,14 @@ class TestCauses:
     def test_a_missing_magnet_is_named(self) -> None:
         lost = replace(knob(), magnets=knob().magnets[:2])
         poses = locate_body(self.array, knob(), readings_of(self.array, lost, self.position_m, self.R, self.rng))
-        assert poses.flags == [("missing m3",)] * 20
+        assert all("missing m3" in flags for flags in poses.flags)
         assert nees(poses, self.position_m, self.R).mean() < 2.0
 
     def test_a_dead_sensor_is_named(self) -> None:
         readings = readings_of(self.array, knob(), self.position_m, self.R, self.rng)
         readings[:, 3:6] = 0.0
         poses = locate_body(self.array, knob(), readings)
-        assert sum(flags == ("sensor s2",) for flags in poses.flags) >= 19
+        assert sum("sensor s2" in flags for flags in poses.flags) >= 19
 
     def test_a_moment_that_is_wrong_is_a_misfit(self) -> None:
         wrong = knob().magnets[0]

@@ -54,6 +54,9 @@ class PoseFit {
         columns_(room.take<T>(D * c.n_channels)),
         residual_(room.take<T>(c.n_channels)) {}
 
+  const T *columns() const { return columns_; }    // (n_channels, 6) and (n_channels): of the last linearisation
+  const T *residual() const { return residual_; }  // without the common field
+
   template <class Channels>
   void run(Channels &c, int64_t n, const int64_t *row, const double *start, const KnownPose *known,
            const PoseEnds &out) {
@@ -124,18 +127,32 @@ class PoseFit {
     }
   }
 
-  // Sum of the fields of all magnets at a sensor.
-  template <class Channels>
-  void place_magnets(const Channels &, const PoseState<T> &p) {
-    for (int64_t k = 0; k < p_.n_magnets; ++k)
+  // Arms and moments of the magnets in the array's frame; `strength` of each moment, or null.
+  void place_magnets(const PoseState<T> &p, const double *strength) {
+    for (int64_t k = 0; k < p_.n_magnets; ++k) {
+      const double factor = strength ? strength[k] : 1.0;
       for (int i = 0; i < 3; ++i) {
         const double *a = p_.places + 3 * k, *m = p_.moments + 3 * k;
         arms_[3 * k + i] = p.R[i][0] * a[0] + p.R[i][1] * a[1] + p.R[i][2] * a[2];
-        moments_[3 * k + i] = p.R[i][0] * m[0] + p.R[i][1] * m[1] + p.R[i][2] * m[2];
+        moments_[3 * k + i] = factor * (p.R[i][0] * m[0] + p.R[i][1] * m[1] + p.R[i][2] * m[2]);
       }
+    }
   }
 
- private:
+  // Readings (n_channels) of one magnet of unit strength, placed before, without the common field.
+  template <class Channels>
+  void read_magnet(const Channels &c, const PoseState<T> &p, int64_t k, double strength, T *readings) const {
+    for (int64_t i = c.first(c.n_sensors); i < c.n_channels; ++i) readings[i] = T{};
+    for (int64_t s = 0; s < c.n_sensors; ++s) {
+      T d[3], b[3];
+      for (int i = 0; i < 3; ++i) d[i] = c.sensors[3 * s + i] - p.x[i] - arms_[3 * k + i];
+      field(Ray<T>::from(d), reinterpret_cast<const T(&)[3]>(moments_[3 * k]), b);
+      for (T &x : b) x *= 1.0 / strength;
+      c.read_field(s, b, readings);
+    }
+    c.template project<1>(readings);
+  }
+
   static void clear(PoseState<T> &state) {
     T *x = reinterpret_cast<T *>(&state);
     for (unsigned j = 0; j < sizeof(state) / sizeof(T); ++j) x[j] = T{};
@@ -143,8 +160,8 @@ class PoseFit {
 
   // Chi-square and normal equations of the trial poses.
   template <class Channels>
-  void linearise(Channels &c, PoseState<T> &p) {
-    place_magnets(c, p);
+  void linearise(Channels &c, PoseState<T> &p, const double *strength = nullptr) {
+    place_magnets(p, strength);
     p.nearest = T{};
     for (int64_t i = c.first(c.n_sensors); i < c.n_channels; ++i) {
       residual_[i] = c.y[i];
@@ -196,6 +213,7 @@ class PoseFit {
     }
   }
 
+ private:
   // The trial pose after a step of bounded length; by how much it promises to lower chi-square.
   static T move(const PoseState<T> &at, T (&step)[D], PoseState<T> &trial) {
     const T way2 = (step[0] * step[0] + step[1] * step[1] + step[2] * step[2]) * at.nearest * at.nearest;
@@ -215,6 +233,7 @@ class PoseFit {
     return promised;
   }
 
+ public:
   // Rotate by a small vector, to its second order, as the unit quaternion (psi/2, 1) does; R stays a rotation.
   static MAGLOC_INLINE void rotate(const T (&psi)[3], const T (&R)[3][3], T (&result)[3][3]) {
     const T h[3] = {0.5 * psi[0], 0.5 * psi[1], 0.5 * psi[2]}, scale = 2.0 / (1.0 + dot(h, h));
@@ -228,6 +247,7 @@ class PoseFit {
     }
   }
 
+ private:
   // Whether poses are so near a known optimum that they lead to it, as far as their chi-square promises the same.
   MAGLOC_INLINE static auto leads_to(const PoseState<T> &at, const T &decrement, const T (&x)[3], const T (&R)[3][3],
                                      const T &chi2) {

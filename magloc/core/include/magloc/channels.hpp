@@ -127,6 +127,10 @@ struct General {
   MAGLOC_INLINE void fill_residual(int64_t s, const T (&b)[3], T *r) const {
     for (int64_t c = first(s); c < first(s + 1); ++c) r[c] = y[c] - gain_of(c, b);
   }
+  // Readings of a small field b at one sensor.
+  MAGLOC_INLINE void read_field(int64_t s, const T (&b)[3], T *r) const {
+    for (int64_t c = first(s); c < first(s + 1); ++c) r[c] = gain_of(c, b);
+  }
   bool few_digits_do(int64_t) const { return false; }
 
  protected:

@@ -27,6 +27,7 @@
   X(refine, refinement)                       \
   X(refine_poses, pose_refinement)            \
   X(search_poses, pose_search)                \
+  X(follow_body, pose_track)                  \
   X(candidate_bases, candidate_positions)     \
   X(choose_candidates, candidate_choice)      \
   X(search_optima, search)                    \
