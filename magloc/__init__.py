@@ -10,7 +10,6 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "Bounds": "magloc.bounds.crlb",
-        "BodyLocator": "magloc.bodies.locator",
         "BodyPrior": "magloc.calibration.bodies.calibrate",
         "Calibration": "magloc.calibration.results",
         "CalibrationPrior": "magloc.calibration.array",
@@ -70,6 +69,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "geomagnetic": ":magloc.fields.geomagnetic",
         "live": ":magloc.live",
         "locate": "magloc.localization.locator",
+        "locate_body": "magloc.bodies.locator",
         "moments_on_sphere": "magloc.directions",
         "plots": ":magloc.plots",
         "read_log": "magloc.logs.read",

@@ -2,7 +2,7 @@ from magloc import datasets as datasets
 from magloc import live as live
 from magloc import plots as plots
 from magloc import viewer as viewer
-from magloc.bodies.locator import BodyLocator as BodyLocator
+from magloc.bodies.locator import locate_body as locate_body
 from magloc.bounds.crlb import Bounds as Bounds
 from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds
 from magloc.bounds.maps import bound_map as bound_map

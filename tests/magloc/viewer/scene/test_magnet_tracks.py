@@ -17,7 +17,7 @@ def test_magnets_move_and_turn_with_the_body() -> None:
     array = joystick.nominal_array()
     device = joystick.draw_joystick(rng)
     readings = device.read(position, rotation, rng)
-    found = magloc.BodyLocator(array, knob).fit_rows(readings.values_T, time_s=readings.time_s)
+    found = magloc.locate_body(array, knob, readings)
     result = magnet_tracks(knob, found)
     assert result.ids == (1, 2, 3)
     rows = np.flatnonzero(found.solved)
