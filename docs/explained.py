@@ -55,6 +55,7 @@ EXPLAINED = {
     "dipole-moment": "magloc.equivalent_dipole",
     "single-sensor-ranging": "magloc.SourceLine magloc.fit_source_line magloc.distance_along_line",
     "gradient-tensor": "magloc.fit_gradient_tensor magloc.GradientTensor",
+    "joystick": "magloc.calibrate_body magloc.BodyPrior magloc.locate_body sims.joystick",
     "calibration": "magloc.calibrate magloc.Calibration magloc.CalibrationPrior magloc.plots.calibration",
     "detection-range-and-bounds": "magloc.cramer_rao_bounds magloc.Bounds magloc.bound_map magloc.moments_on_sphere"
     " magloc.detection_range magloc.MatchedFilterDetector magloc.plots.bound_reach"

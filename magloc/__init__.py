@@ -10,6 +10,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "Bounds": "magloc.bounds.crlb",
+        "BodyPrior": "magloc.calibration.bodies.calibrate",
         "Calibration": "magloc.calibration.results",
         "CalibrationPrior": "magloc.calibration.array",
         "Compensation": "magloc.compensation.results",
@@ -52,6 +53,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Truth": "magloc.truth",
         "bound_map": "magloc.bounds.maps",
         "calibrate": "magloc.calibration.calibrate",
+        "calibrate_body": "magloc.calibration.bodies.calibrate",
         "check_quality": "magloc.deliverables.quality",
         "compensate": "magloc.compensation.compensate",
         "convergence_map": "magloc.convergence.over_starts",
@@ -68,6 +70,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "geomagnetic": ":magloc.fields.geomagnetic",
         "live": ":magloc.live",
         "locate": "magloc.localization.locator",
+        "locate_body": "magloc.bodies.locator",
         "moments_on_sphere": "magloc.directions",
         "plots": ":magloc.plots",
         "read_log": "magloc.logs.read",

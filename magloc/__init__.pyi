@@ -2,10 +2,13 @@ from magloc import datasets as datasets
 from magloc import live as live
 from magloc import plots as plots
 from magloc import viewer as viewer
+from magloc.bodies.locator import locate_body as locate_body
 from magloc.bounds.crlb import Bounds as Bounds
 from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds
 from magloc.bounds.maps import bound_map as bound_map
 from magloc.calibration.array import CalibrationPrior as CalibrationPrior
+from magloc.calibration.bodies.calibrate import BodyPrior as BodyPrior
+from magloc.calibration.bodies.calibrate import calibrate_body as calibrate_body
 from magloc.calibration.calibrate import calibrate as calibrate
 from magloc.calibration.results import Calibration as Calibration
 from magloc.compensation.compensate import compensate as compensate

@@ -1,15 +1,17 @@
 """True positions and moments of a source: truth files, and their values at the rows of readings.
 
 A truth file is CSV with ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2][, sigma_m]``, one row per instant. For a
-moment of unknown strength ``axis_x, axis_y, axis_z`` stand in place of the moment.
+moment of unknown strength ``axis_x, axis_y, axis_z`` stand in place of the moment. Of a body the file has the attitude
+``qx, qy, qz, qw`` (scalar last, from the body's frame), and optionally its error ``sigma_deg``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,11 +19,16 @@ from arrays.io.csv import Column, Table, read_table
 from arrays.io.errors import InputError
 from arrays.io.results import Quantity
 from arrays.typing import FloatArray, IntArray
+from magloc.navigation.poses import unit_rotation
 from magloc.readings import Readings
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
 TRUE_AXIS_COLUMNS = ("axis_x", "axis_y", "axis_z")
+TRUE_ROTATION_COLUMNS = ("qx", "qy", "qz", "qw")
 STATE_COLUMNS = TRUE_POSITION_COLUMNS + TRUE_MOMENT_COLUMNS
 STATE_QUANTITIES = {
     "time_s": Quantity("s", "time"),
@@ -59,6 +66,10 @@ class Truth:
         Direction of a moment of unknown strength, unit vectors.
     sigma_m : ndarray, shape (n,), optional
         Standard deviation of the truth's own position, per axis [m]; exact without it.
+    rotation : Rotation of n, optional
+        Attitude of a body: rotation from its frame.
+    sigma_rad : ndarray, shape (n,), optional
+        Standard deviation of the truth's own attitude, about each axis [rad]; exact without it.
 
     Examples
     --------
@@ -74,6 +85,8 @@ class Truth:
     name: str = "truth"
     axis: FloatArray | None = None
     sigma_m: FloatArray | None = None
+    rotation: Rotation | None = None
+    sigma_rad: FloatArray | None = None
 
 
 def read_truth(path: str | PathLike[str]) -> Truth:
@@ -102,7 +115,8 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     (101, 3)
     """
     table = read_table(path, "a header with time_s, x_m and y_m")
-    known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS, *TRUE_AXIS_COLUMNS, "sigma_m")
+    groups = (TRUE_POSITION_COLUMNS, TRUE_MOMENT_COLUMNS, TRUE_AXIS_COLUMNS, TRUE_ROTATION_COLUMNS)
+    known = ("time_s", *chain(*groups), "sigma_m", "sigma_deg")
     for name in ("time_s", "x_m", "y_m"):
         table.require(name, known)
     table.refuse_unknown(known)
@@ -111,7 +125,17 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]
     position_m[:, : len(columns)] = table.complete(columns)
     moment_Am2 = table.complete(TRUE_MOMENT_COLUMNS) if table.has_group(TRUE_MOMENT_COLUMNS) else None
-    return Truth(time_s, position_m, moment_Am2, str(path), _axes(table, moment_Am2 is not None), _sigmas(table))
+    axis, sigma_deg = _axes(table, moment_Am2 is not None), _sigmas(table, "sigma_deg")
+    return Truth(
+        time_s,
+        position_m,
+        moment_Am2,
+        str(path),
+        axis,
+        _sigmas(table, "sigma_m"),
+        unit_rotation(table, TRUE_ROTATION_COLUMNS) if table.has_group(TRUE_ROTATION_COLUMNS) else None,
+        None if sigma_deg is None else np.radians(sigma_deg),
+    )
 
 
 def _axes(table: Table, moments: bool) -> FloatArray | None:
@@ -129,12 +153,12 @@ def _axes(table: Table, moments: bool) -> FloatArray | None:
     return axis / length[:, None]
 
 
-def _sigmas(table: Table) -> FloatArray | None:
-    if "sigma_m" not in table.header:
+def _sigmas(table: Table, name: str) -> FloatArray | None:
+    if name not in table.header:
         return None
-    sigma_m = table.complete(("sigma_m",))[:, 0]
-    table.refuse((sigma_m < 0.0)[:, None], ("sigma_m",), "found a negative number, expected a standard deviation")
-    return sigma_m
+    sigma = table.complete((name,))[:, 0]
+    table.refuse((sigma < 0.0)[:, None], (name,), "found a negative number, expected a standard deviation")
+    return sigma
 
 
 def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:

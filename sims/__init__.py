@@ -11,6 +11,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "MagneticScenario": "sims.magnetics.scenario",
         "TableScenario": "sims.mockup.table_run",
         "experiments": ":sims.experiments",
+        "joystick": ":sims.magnetics.joystick",
         "read_scenario": "sims.scenarios",
         "rendered_frame": "sims.mockup.frames",
         "run_many": "sims.montecarlo",

@@ -2,6 +2,7 @@ from sims import experiments as experiments
 from sims.attitude.flights import FlightSettings as FlightSettings
 from sims.attitude.flights import simulate_flight as simulate_flight
 from sims.attitude.scenario import AttitudeScenario as AttitudeScenario
+from sims.magnetics import joystick as joystick
 from sims.magnetics.files import write_simulation as write_simulation
 from sims.magnetics.scenario import MagneticScenario as MagneticScenario
 from sims.mockup.frames import rendered_frame as rendered_frame

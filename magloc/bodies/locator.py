@@ -398,6 +398,17 @@ def locate_body(
     -------
     BodyPoses
         All distinct poses of every row, best first.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import magloc
+    >>> from sims import joystick
+    >>> rng = np.random.default_rng(0)
+    >>> device = joystick.draw_joystick(rng)
+    >>> readings = device.read(*joystick.random_poses(rng, 3), rng)
+    >>> magloc.locate_body(device.true_array, device.true_knob, readings).R[:, 0].shape
+    (3, 3, 3)
     """
     measured = as_readings(readings)
     warn_of_doubts(array, measured)

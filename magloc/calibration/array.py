@@ -21,12 +21,10 @@ from arrays.noise import proportional_noise
 from arrays.typing import BoolArray, FloatArray
 from magloc.calibration import continuation as calibration_steps
 from magloc.calibration import least_squares as source_fit
-from magloc.calibration import model as moving_source
-from magloc.calibration.least_squares import CalibrationIterate
-from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, CalibrationProblem, MomentKind
-from magloc.calibration.observability import unobservable_directions
+from magloc.calibration.model import CalibrationProblem, CalibrationState, MomentKind
+from magloc.calibration.observability import unobservable_of_source
 from magloc.calibration.results import SourceCalibration
-from magloc.least_squares import Optimum
+from magloc.calibration.sensors import AXES, GAINS, OFFSET, PER_SENSOR, POSITION
 from magloc.localization.locator import Locator
 from magloc.measurement.rows import check_rows
 
@@ -137,9 +135,7 @@ def calibrate_on_path(
     start = calibration_steps.nominal_state(
         problem, position[rows], np.zeros_like(position[rows]) if known is None else known[rows]
     )
-    return _result(
-        problem, calibration_steps.fit_calibration(problem, calibration_steps.fit_source_on_path(problem, start)), rows
-    )
+    return _fit(problem, calibration_steps.fit_source_on_path(problem, start), rows)
 
 
 def self_calibrate(
@@ -153,10 +149,7 @@ def self_calibrate(
     """Calibrate by a source on an unknown path, from fixes with the nominal array."""
     readings, attitude = _check_inputs(array, readings_T, world_from_array)
     problem = _problem(array, readings, attitude, prior, True, False, moment)
-    nowhere = np.zeros((len(readings), 3))
-    doubtful = calibration_steps.inflate_field_noise(
-        problem, calibration_steps.nominal_state(problem, nowhere, nowhere)
-    )
+    doubtful = calibration_steps.inflate_field_noise(problem, np.zeros(problem.prior.shape))
     fixes = Locator(doubtful, body_length_m=0.0, exclude_faulty=False).fit_rows(readings)
     rows = fixes.solved & _usable_rows(problem)
     if not rows.any():
@@ -171,7 +164,7 @@ def self_calibrate(
     if moment == "constant":
         # A row on the wrong side of the array would bias the common moment, so all rows are fixed again.
         start = calibration_steps.with_common_moment(problem, start)
-    return _result(problem, calibration_steps.fit_calibration(problem, start), rows)
+    return _fit(problem, start, rows)
 
 
 def _check_inputs(
@@ -239,27 +232,22 @@ def _check_counts(problem: CalibrationProblem) -> None:
         )
 
 
-def _result(
-    problem: CalibrationProblem, fitted: tuple[CalibrationProblem, Optimum[CalibrationIterate]], rows: BoolArray
-) -> SourceCalibration:
-    problem, optimum = fitted
+def _fit(problem: CalibrationProblem, start: CalibrationState, rows: BoolArray) -> SourceCalibration:
+    start = calibration_steps.approach_optimum(problem, start)
+    problem, optimum = calibration_steps.fit_calibration(problem, start)
     state = optimum.point.state
     stated = replace(problem, noise_scale=1.0)
     nominal = replace(stated, free=np.zeros_like(problem.free))
     nominal_sensors = replace(state, sensors=np.zeros_like(state.sensors))
     before = source_fit.fit_state(nominal, nominal_sensors, max_iterations=_ITERATIONS_BEFORE)
-    after = moving_source.chi2(stated, state)
+    after = stated.chi2(state)
     told = source_fit.information_of_sensors(problem, state)
     n = len(told)
-    values, vectors = np.linalg.eigh(told)
-    relative = (vectors / (1.0 + np.maximum(values, 0.0))) @ vectors.T  # no rounding makes it negative
+    relative = source_fit.posterior_covariance(told)
     covariance = relative * np.outer(problem.prior[problem.free], problem.prior[problem.free])
     deviation = np.zeros(problem.prior.shape)
     deviation[problem.free] = np.sqrt(np.diagonal(covariance))
     told_numbers = n - float(np.trace(relative))
-    residual = moving_source.residuals(stated, state) * problem.noise_T
-    squares = (residual**2).reshape(len(residual), -1, 3)
-    counts = np.isfinite(problem.readings_T).reshape(squares.shape).sum(axis=(0, 2))
     array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
     return SourceCalibration(
         nominal=problem.array,
@@ -267,16 +255,16 @@ def _result(
         converged=optimum.converged,
         iterations=optimum.iterations,
         rows=rows,
-        chi2_before=moving_source.chi2(nominal, before.point.state),
+        chi2_before=nominal.chi2(before.point.state),
         chi2=after,
         dof_before=problem.n_numbers - problem.n_globals,
         dof=problem.n_numbers - problem.n_globals - told_numbers,
-        residual_rms_T=np.sqrt(squares.sum(axis=(0, 2)) / np.maximum(counts, 1)),
+        residual_rms_T=stated.residual_rms_T(state),
         change=state.sensors,
         sigma=deviation,
         estimated=problem.free,
         covariance=covariance,
-        unobservable=unobservable_directions(problem, state, told),
+        unobservable=unobservable_of_source(problem, state, told),
         position_m=state.position_m + state.height_m * array_from_world[..., 2],
         moment_Am2=np.array(state.moment_Am2),
         readings_T=problem.readings_T,

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
-from magloc.calibration.model import GAINS, PER_SENSOR, unknowns
 from magloc.calibration.modulus import EllipsoidCalibration, calibrate_in_modulus, symmetric
 from magloc.calibration.observability import Unobservable
 from magloc.calibration.results import SourceCalibration, TurningCalibration
+from magloc.calibration.sensors import GAINS, PER_SENSOR, unknowns
 from magloc.measurement.plausibility import warn_of_array, warn_of_moments
 from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings, without_saturated

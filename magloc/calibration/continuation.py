@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,9 +18,9 @@ from arrays.noise import proportional_noise
 from arrays.sensor import Calibration
 from arrays.typing import BoolArray, FloatArray
 from magloc.calibration import least_squares as source_fit
-from magloc.calibration import model as moving_source
 from magloc.calibration.least_squares import CalibrationIterate
-from magloc.calibration.model import GAINS, OFFSET, POSITION, CalibrationProblem, CalibrationState
+from magloc.calibration.model import CalibrationProblem, CalibrationState
+from magloc.calibration.sensors import OFFSET, POSITION, SensorProblem, State, response_factors
 from magloc.least_squares import Optimum
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
@@ -31,12 +32,13 @@ _LARGEST_DOUBT = 0.3
 _BADLY = 20.0
 _NOISE_PASSES = 3
 _MISFIT = 2.0  # χ²/dof above which the stated noise is too small
+Problem = TypeVar("Problem", bound=SensorProblem[Any])
 _HEIGHTS = np.concatenate([-np.geomspace(4.0, 0.05, 8), np.geomspace(0.05, 4.0, 8)])
 
 
 def apply_calibration(array: SensorArray, change: FloatArray) -> SensorArray:
     """Return the array changed by (N, 15): positions [m], gains, axes [rad], offsets [T]."""
-    factors = moving_source.response_factors(change)
+    factors = response_factors(change)
     sensors = []
     for sensor, factor, row in zip(array.sensors, factors, change, strict=True):
         position = np.asarray(sensor.position_m) + row[POSITION]
@@ -51,7 +53,7 @@ def apply_calibration(array: SensorArray, change: FloatArray) -> SensorArray:
 
 def fit_source_on_path(problem: CalibrationProblem, start: CalibrationState) -> CalibrationState:
     """Fit moment and height to a known path with the nominal array."""
-    nominal = replace(inflate_noise(problem, start, 1.0), free=np.zeros_like(problem.free))
+    nominal = replace(inflate_noise(problem, start.sensors, 1.0), free=np.zeros_like(problem.free))
     # At a moment of zero the field is linear in the moment, and the height has no effect.
     linear = replace(nominal, unknown_height=False)
     offsets = _HEIGHTS * problem.array.circumradius if problem.unknown_height else np.zeros(1)
@@ -87,7 +89,7 @@ def relocate(problem: CalibrationProblem, state: CalibrationState, rows: BoolArr
     """Fix some rows again and take the solutions whose moment is nearest to the median."""
     median = np.median(state.moment_Am2, axis=0)
     position, moment = state.position_m.copy(), state.moment_Am2.copy()
-    locator = Locator(inflate_field_noise(problem, state, share), body_length_m=0.0, exclude_faulty=False)
+    locator = Locator(inflate_field_noise(problem, state.sensors, share), body_length_m=0.0, exclude_faulty=False)
     fixes = locator.fit_rows(problem.readings_T[rows])
     for t, fix in zip(np.flatnonzero(rows), fixes, strict=True):
         if fix.solutions:
@@ -99,30 +101,24 @@ def relocate(problem: CalibrationProblem, state: CalibrationState, rows: BoolArr
     return replace(state, position_m=position, moment_Am2=moment)
 
 
-def inflate_field_noise(problem: CalibrationProblem, state: CalibrationState, share: float = 1.0) -> SensorArray:
-    """Return a state's array with noise in proportion to the field, by a share of the prior.
-
-    The prior allows for wrong gains and for the change of the field between nominal and true position. At a source one
-    circumradius away this change is three times the displacement over that distance.
-    """
-    deviations = np.where(problem.free, problem.prior, 0.0)
-    displaced = 3.0 * deviations[:, POSITION].max() / problem.array.circumradius
-    doubt = share * min(_LARGEST_DOUBT, float(np.hypot(deviations[:, GAINS].max(), displaced)))
-    array = apply_calibration(problem.array, state.sensors)
+def inflate_field_noise(problem: SensorProblem[State], sensors: FloatArray, share: float = 1.0) -> SensorArray:
+    """Return the array of sensors (N, 15) with noise in proportion to the field, by a share of the prior's doubt."""
+    doubt = share * min(_LARGEST_DOUBT, problem.field_doubt)
+    array = apply_calibration(problem.array, sensors)
     fractions = np.hypot(array.noise_fractions, doubt).tolist()
-    sensors = tuple(replace(s, noise_fraction=f) for s, f in zip(array.sensors, fractions, strict=True))
-    return replace(array, sensors=sensors)
+    inflated = tuple(replace(s, noise_fraction=f) for s, f in zip(array.sensors, fractions, strict=True))
+    return replace(array, sensors=inflated)
 
 
-def inflate_noise(problem: CalibrationProblem, state: CalibrationState, share: float) -> CalibrationProblem:
-    """Return the problem with the noise near a state, raised by a share of the prior."""
-    array = inflate_field_noise(problem, state, share)
+def inflate_noise(problem: Problem, sensors: FloatArray, share: float) -> Problem:
+    """Return the problem with the noise at some sensors (N, 15), raised by a share of the prior."""
+    array = inflate_field_noise(problem, sensors, share)
     offsets = share * np.where(problem.free, problem.prior, 0.0)[:, OFFSET].max(axis=1)
-    sensors = tuple(
+    inflated = tuple(
         replace(sensor, noise_T=float(np.hypot(sensor.noise_T, offset)))
         for sensor, offset in zip(array.sensors, offsets, strict=True)
     )
-    return replace(problem, noise_T=proportional_noise(replace(array, sensors=sensors), problem.readings_T))
+    return replace(problem, noise_T=proportional_noise(replace(array, sensors=inflated), problem.readings_T))
 
 
 def approach_optimum(
@@ -130,7 +126,7 @@ def approach_optimum(
 ) -> CalibrationState:
     """Return a state near the optimum, fitted with noise that shrinks step by step."""
     for share in shares:
-        lenient = inflate_noise(problem, state, share)
+        lenient = inflate_noise(problem, state.sensors, share)
         optimum = source_fit.fit_state(lenient, state, tolerance=_ROUGHLY)
         if not problem.is_on_path:
             optimum = _relocate_misfits(lenient, optimum, share)
@@ -139,10 +135,10 @@ def approach_optimum(
 
 
 def _relocate_misfits(
-    problem: CalibrationProblem, optimum: Optimum[CalibrationIterate], share: float
-) -> Optimum[CalibrationIterate]:
+    problem: CalibrationProblem, optimum: Optimum[CalibrationIterate[CalibrationState]], share: float
+) -> Optimum[CalibrationIterate[CalibrationState]]:
     """Fix badly fitted rows again; on the wrong side of the array they never return."""
-    chi2 = np.sum(moving_source.residuals(problem, optimum.point.state) ** 2, axis=1)
+    chi2 = np.sum(problem.residuals(problem.prediction_T(optimum.point.state)) ** 2, axis=1)
     bad = chi2 > _BADLY * np.median(chi2)
     if not bad.any():
         return optimum
@@ -151,19 +147,16 @@ def _relocate_misfits(
     return other if other.point.cost < optimum.point.cost else optimum
 
 
-def fit_calibration(
-    problem: CalibrationProblem, start: CalibrationState
-) -> tuple[CalibrationProblem, Optimum[CalibrationIterate]]:
-    """Return the problem with the noise at the optimum, and the optimum.
+def fit_calibration(problem: Problem, state: State) -> tuple[Problem, Optimum[CalibrationIterate[State]]]:
+    """Return the problem with the noise at the optimum, and the optimum near a state.
 
     If residuals exceed the stated noise, priors count for as much as by the noise that the residuals show.
     """
-    state = approach_optimum(problem, start)
     for _ in range(_NOISE_PASSES if problem.array.noise_fractions.any() else 1):
-        problem = inflate_noise(problem, state, 0.0)
+        problem = inflate_noise(problem, state.sensors, 0.0)
         optimum = source_fit.fit_state(problem, state)
         state = optimum.point.state
-    excess = moving_source.chi2(problem, state) / max(1, problem.n_numbers - len(problem.estimated_indices))
+    excess = problem.chi2(state) / max(1, problem.n_numbers - len(problem.estimated_indices))
     if excess > _MISFIT:
         problem = replace(problem, noise_scale=math.sqrt(excess))
         optimum = source_fit.fit_state(problem, state)

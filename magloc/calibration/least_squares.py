@@ -1,27 +1,20 @@
-"""Least squares for an array and a moving source, with the unknowns of the rows eliminated.
+"""Least squares for an array and what moves past it, with the unknowns of the rows eliminated.
 
 The unknowns of a row touch no other row. They are eliminated by a QR factorisation of their own few columns, batched
 over the rows (the Schur complement in its orthogonal form), so that a step solves one linear system in the unknowns of
-the sensors and of the source alone.
+the sensors and of the source or body alone.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Generic
 
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.calibration.model import (
-    PER_SENSOR,
-    CalibrationProblem,
-    CalibrationState,
-    Linearisation,
-    cost,
-    linearise,
-    row_priors,
-)
+from magloc.calibration.sensors import PER_SENSOR, Linearisation, SensorProblem, State
 from magloc.least_squares import Optimum, damped_step, minimise
 
 # Enough to keep unknowns without information in place, too little to count as information.
@@ -51,18 +44,22 @@ class ReducedEquations:
 
 
 def eliminate_rows(
-    problem: CalibrationProblem, state: CalibrationState, linear: Linearisation, damping: float = _NO_DAMPING
+    problem: SensorProblem[State],
+    linear: Linearisation,
+    row_prior: tuple[FloatArray, FloatArray],
+    damping: float = _NO_DAMPING,
 ) -> ReducedEquations:
     """Return the normal equations of sensors and source, with the rows' unknowns eliminated.
 
-    The damping is that of the rows' unknowns, relative to their information.
+    The prior of the rows' unknowns is 1/σ and their deviation from it, (T, n) each. The damping is that of the rows'
+    unknowns, relative to their information.
 
     With the rows' columns ``J = Q R`` (priors and damping appended as further rows) what remains of the other columns
     is their part orthogonal to Q.
     """
     n_rows, n_channels, n = linear.by_row.shape
     n_sensors = problem.array.n_sensors
-    weight, deviation = row_priors(problem, state)
+    weight, deviation = row_prior
     size = np.sqrt(np.einsum("tcn,tcn->tn", linear.by_row, linear.by_row) + weight**2)
     # An unknown without information keeps a column of its own, so that it does not change.
     damped = np.sqrt(damping) * np.where(size > 0.0, size, 1.0)[..., None] * np.eye(n)
@@ -75,11 +72,11 @@ def eliminate_rows(
     blocks = np.swapaxes(q_readings.reshape(n_rows, n_sensors, 3, n), -1, -2) @ linear.by_sensor
     by_row = np.concatenate(
         [
-            blocks.transpose(0, 2, 1, 3).reshape(n_rows, n, -1)[..., problem.free.ravel()],
+            blocks.transpose(0, 2, 1, 3).reshape(n_rows, n, -1),
             np.swapaxes(q_readings, -1, -2) @ linear.by_source,
         ],
         axis=-1,
-    )
+    )[..., problem.estimated_indices]
     flat = by_row.reshape(n_rows * n, by_row.shape[-1])
     information, gradient = _normal_equations(linear)
     information = information[np.ix_(problem.estimated_indices, problem.estimated_indices)] - flat.T @ flat
@@ -93,90 +90,72 @@ def row_step(equations: ReducedEquations, step: FloatArray) -> FloatArray:
     return np.asarray(-np.linalg.solve(equations.row_factor, right[..., None])[..., 0], dtype=np.float64)
 
 
-def information_of_sensors(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
-    """Return the information (F, F) of the readings on the sensors' free unknowns.
+def information_of_sensors(problem: SensorProblem[State], state: State) -> FloatArray:
+    """Return the information (p, p) of the readings on the shared unknowns that have a prior.
 
     All other unknowns are eliminated. The unit of an unknown is its prior standard deviation.
     """
-    information = eliminate_rows(problem, state, linearise(problem, state)).information
-    n = int(problem.free.sum())
+    information = eliminate_rows(problem, problem.linearise(state), problem.row_priors(state)).information
+    n = len(problem.shared_deviations(state))
     cross, own = information[:n, n:], information[n:, n:]
     # The pseudo-inverse allows constants of the source without information.
     return information[:n, :n] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
 
 
+def posterior_covariance(information: FloatArray) -> FloatArray:
+    """Return the covariance (p, p) of unknowns with unit priors, to which readings add information."""
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray((vectors / (1.0 + np.maximum(values, 0.0))) @ vectors.T)  # no rounding makes it negative
+
+
 @dataclass(frozen=True, eq=False)
-class CalibrationIterate:
+class CalibrationIterate(Generic[State]):
     """A state of a problem, as an iterate of :func:`magloc.least_squares.minimise`."""
 
-    problem: CalibrationProblem
-    state: CalibrationState
+    problem: SensorProblem[State]
+    state: State
 
     @cached_property
     def cost(self) -> float:
         """χ² of the readings and of all priors."""
         with np.errstate(over="ignore", invalid="ignore"):
-            return cost(self.problem, self.state)
+            return self.problem.cost(self.state)
 
     @cached_property
     def _linear(self) -> Linearisation:
-        return linearise(self.problem, self.state)
+        return self.problem.linearise(self.state)
 
-    def step(self, damping: float) -> tuple[CalibrationIterate, float]:
+    def step(self, damping: float) -> tuple[CalibrationIterate[State], float]:
         """Return the state after a damped step; the unknowns of the rows are damped too."""
         problem, state = self.problem, self.state
-        equations = eliminate_rows(problem, state, self._linear, damping)
-        # Priors of the sensors' unknowns, whose unit is the prior deviation; the source has none.
-        n_free = int(problem.free.sum())
+        equations = eliminate_rows(problem, self._linear, problem.row_priors(state), damping)
+        # The unit of the unknowns with a prior is the prior's standard deviation.
+        deviations = problem.shared_deviations(state)
+        n = len(deviations)
         information, gradient = equations.information.copy(), equations.gradient.copy()
-        information[range(n_free), range(n_free)] += 1.0
-        gradient[:n_free] += (state.sensors / problem.prior)[problem.free]
+        information[range(n), range(n)] += 1.0
+        gradient[:n] += deviations
         step, promised = damped_step(information, gradient, damping)
         # No step goes farther than the prior: the field is far from linear in the positions.
-        step /= max(1.0, float(np.abs(step[:n_free]).max(initial=0.0)))
-        trial = replace(self, state=apply_step(problem, state, step, row_step(equations, step)))
+        step /= max(1.0, float(np.abs(step[:n]).max(initial=0.0)))
+        trial = replace(self, state=problem.after_step(state, step, row_step(equations, step)))
         return trial, promised + float(np.sum(equations.row_gradient**2))
 
 
 def fit_state(
-    problem: CalibrationProblem, start: CalibrationState, *, tolerance: float = 1e-3, max_iterations: int = 100
-) -> Optimum[CalibrationIterate]:
+    problem: SensorProblem[State], start: State, *, tolerance: float = 1e-3, max_iterations: int = 100
+) -> Optimum[CalibrationIterate[State]]:
     """Minimise χ² by Levenberg-Marquardt steps.
 
     Stop when a step promises to lower χ² by less than the tolerance or a part in 10¹⁰.
     """
 
-    def least(fit: CalibrationIterate) -> float:
+    def least(fit: CalibrationIterate[State]) -> float:
         return max(tolerance, _LEAST_SHARE * fit.cost)
 
     return minimise(
         CalibrationIterate(problem, start), least, last_damping=_LAST_DAMPING, max_iterations=max_iterations
     )
-
-
-def apply_step(
-    problem: CalibrationProblem, state: CalibrationState, step: FloatArray, of_rows: FloatArray
-) -> CalibrationState:
-    """Return a state after a step (P,) of sensors and source, and (T, n) of the rows."""
-    n = int(problem.free.sum())
-    sensors = state.sensors.copy()
-    sensors[problem.free] += problem.prior[problem.free] * step[:n]
-    position, height, moment = state.position_m, state.height_m, state.moment_Am2
-    if problem.unknown_position:
-        # A source that jumps far away would not return, because its field and all derivatives vanish.
-        length = np.linalg.norm(of_rows[:, :3], axis=1, keepdims=True)
-        radius = problem.array.circumradius
-        of_rows = of_rows * (radius / np.maximum(length, radius))
-        position = position + of_rows[:, :3]
-    if problem.unknown_height:
-        height = height + float(step[-1])
-    if problem.moment == "free":
-        moment = moment + of_rows[:, -6:-3]
-    elif problem.moment == "constant":
-        moment = moment + step[n : n + 3]
-    elif problem.axis is not None:
-        moment = moment + step[n] * problem.axis
-    return CalibrationState(sensors, position, height, moment, state.common_T + of_rows[:, -3:])
 
 
 def _normal_equations(linear: Linearisation) -> tuple[FloatArray, FloatArray]:

@@ -13,21 +13,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from arrays.array import SensorArray
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import FloatArray
+from magloc.calibration.sensors import (
+    POSITION,
+    Linearisation,
+    SensorProblem,
+    readings_of_fields,
+    sensor_derivatives,
+    whitened_responses,
+)
 from magloc.fields import dipole
 
 MomentKind = Literal["constant", "free", "known", "axis"]
 """The moment in the world frame: one unknown vector for all rows, one for every row, known, or of known directions and
 one unknown strength."""
-PER_SENSOR = 15
-POSITION, GAINS, AXES, OFFSET = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 15)
-AXIS_PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
-"""Channel and component of the six axis unknowns."""
 _EXACT_M = 1e-7  # least standard deviation of a measured position
-_CHANNEL, _COMPONENT = (list(places) for places in zip(*AXIS_PAIRS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,22 +56,12 @@ class CalibrationState:
     common_T: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationProblem:
-    """Readings, and which quantities of sensors, source and rows are unknown.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CalibrationProblem(SensorProblem[CalibrationState]):
+    """Readings of a moving source, and which quantities of sensors, source and rows are unknown.
 
     Attributes
     ----------
-    array : SensorArray
-        Nominal array of vector sensors.
-    readings_T : ndarray, shape (T, C)
-        Raw readings; NaN where missing.
-    noise_T : ndarray, shape (T, C)
-        Standard deviations.
-    prior : ndarray, shape (N, 15)
-        Standard deviations of the sensors' unknowns around the nominal array.
-    free : ndarray of bool, shape (N, 15)
-        True for the sensors' unknowns that are estimated.
     world_from_array : ndarray, shape (T, 3, 3)
         Attitude of the array in every row.
     unknown_position : bool
@@ -84,15 +75,8 @@ class CalibrationProblem:
         Standard deviations of the measured positions.
     axis : ndarray, shape (T, 3), optional
         Directions of the moment in the world frame.
-    noise_scale : float
-        Factor by which residuals exceed the stated noise.
     """
 
-    array: SensorArray
-    readings_T: FloatArray
-    noise_T: FloatArray
-    prior: FloatArray
-    free: BoolArray
     world_from_array: FloatArray
     unknown_position: bool
     unknown_height: bool
@@ -100,7 +84,6 @@ class CalibrationProblem:
     path_m: FloatArray | None = None
     path_sigma_m: FloatArray | None = None
     axis: FloatArray | None = None
-    noise_scale: float = 1.0
 
     @property
     def is_on_path(self) -> bool:
@@ -127,151 +110,84 @@ class CalibrationProblem:
         """Number of unknowns of one row."""
         return 3 * self.unknown_position + 3 * (self.moment == "free") + 3
 
-    @property
-    def estimated_indices(self) -> NDArray[np.intp]:
-        """Indices of the estimated unknowns among the 15 N of the sensors and the g of the source."""
-        n = self.free.size
-        return np.concatenate([np.flatnonzero(self.free.ravel()), np.arange(n, n + self.n_globals)])
+    def prediction_T(self, state: CalibrationState) -> FloatArray:
+        """Return the predicted readings, shape (T, C) [T]."""
+        points, sources, moments = self._geometry(state)
+        fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
+        return readings_of_fields(self.array, state.sensors, fields)
 
+    def linearise(self, state: CalibrationState) -> Linearisation:
+        """Return the residuals of a state and their derivatives by every unknown."""
+        array = self.array
+        n_rows, n_sensors = len(state.position_m), array.n_sensors
+        points, sources, moments = self._geometry(state)
+        response = whitened_responses(self, state.sensors)
+        field_gradient = dipole.gradient_tensor(points, sources, moments)
+        gradient = response @ field_gradient
+        by_moment = response @ dipole.field_matrix(points, sources)
+        fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
 
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """Whitened residuals and their derivatives.
+        array_from_world = np.swapaxes(self.world_from_array, -1, -2)[:, None]
+        by_world_moment = by_moment @ array_from_world
+        up = -gradient @ array_from_world[..., 2:]
+        none = np.empty((n_rows, n_sensors, 3, 0))
+        by_moments = {"constant": by_world_moment}
+        if self.axis is not None:
+            by_moments["axis"] = np.einsum("tnab,tb->tna", by_world_moment, self.axis)[..., None]
+        by_source = [
+            by_moments.get(self.moment, none),
+            up if self.unknown_height else none,
+        ]
+        by_row = [
+            -gradient if self.unknown_position else none,
+            by_world_moment if self.moment == "free" else none,
+            response,
+        ]
+        shape = (n_rows, array.n_channels)
+        return Linearisation(
+            residual=self.residuals(self.prediction_T(state)),
+            by_sensor=sensor_derivatives(self, state.sensors, fields, field_gradient),
+            by_source=np.concatenate(by_source, axis=-1).reshape(*shape, self.n_globals),
+            by_row=np.concatenate(by_row, axis=-1).reshape(*shape, self.n_row_unknowns),
+        )
 
-    Attributes
-    ----------
-    residual : ndarray, shape (T, C)
-        (prediction - reading) / noise; zero where missing.
-    by_sensor : ndarray, shape (T, N, 3, 15)
-        Derivatives by the unknowns of the channel's sensor, in prior standard deviations.
-    by_source : ndarray, shape (T, C, g)
-        Derivatives by the constant moment and the height.
-    by_row : ndarray, shape (T, C, n)
-        Derivatives by the row's position, moment and common field.
-    """
+    def _geometry(self, state: CalibrationState) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return sensors (N, 3), sources and moments (T, 1, 3), all in the array's frame."""
+        points = self.array.positions + state.sensors[:, POSITION]
+        array_from_world = np.swapaxes(self.world_from_array, -1, -2)
+        sources = state.position_m + state.height_m * array_from_world[..., 2]
+        moments = np.einsum("tab,tb->ta", array_from_world, state.moment_Am2)
+        return points, sources[:, None, :], moments[:, None, :]
 
-    residual: FloatArray
-    by_sensor: FloatArray
-    by_source: FloatArray
-    by_row: FloatArray
+    def row_priors(self, state: CalibrationState) -> tuple[FloatArray, FloatArray]:
+        """Return 1/σ (T, n) of the prior of the rows' unknowns, 0 without one, and their deviations (T, n) from it."""
+        weight, deviation = np.zeros((2, len(state.position_m), self.n_row_unknowns))
+        sigma_T = self.array.common_field_T
+        weight[:, -3:] = 0.0 if sigma_T is None else 1.0 / max(sigma_T, 1e-15)
+        deviation[:, -3:] = state.common_T
+        if self.path_m is not None and self.path_sigma_m is not None:
+            weight[:, :3] = 1.0 / np.maximum(self.path_sigma_m, _EXACT_M)[:, None]
+            deviation[:, :3] = state.position_m - self.path_m
+        return weight, deviation
 
-
-def responses(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
-    """Return (I + E) K of every sensor, (N, 3, 3): from fields in the array's frame to readings."""
-    return response_factors(state.sensors) @ problem.array.channel_gain.reshape(-1, 3, 3)
-
-
-def response_factors(sensors: FloatArray) -> FloatArray:
-    """Return I + E of every sensor, shape (N, 3, 3), from its unknowns (N, 15)."""
-    factors = np.tile(np.eye(3), (len(sensors), 1, 1))
-    factors[:, range(3), range(3)] += sensors[:, GAINS]
-    factors[:, _CHANNEL, _COMPONENT] = sensors[:, AXES]
-    return factors
-
-
-def unknowns(
-    n_sensors: int,
-    *,
-    position: FloatArray | float = 0.0,
-    response: FloatArray | None = None,
-    offset: FloatArray | float = 0.0,
-) -> FloatArray:
-    """Return changes of positions (N, 3), responses E (N, 3, 3) and offsets (N, 3) as (N, 15)."""
-    result = np.zeros((n_sensors, PER_SENSOR))
-    result[:, POSITION], result[:, OFFSET] = position, offset
-    if response is not None:
-        result[:, GAINS] = np.diagonal(response, axis1=-2, axis2=-1)
-        result[:, AXES] = response[..., _CHANNEL, _COMPONENT]
-    return result
-
-
-def prediction_T(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
-    """Return the predicted readings, shape (T, C) [T]."""
-    points, sources, moments = _geometry(problem, state)
-    fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
-    readings = np.einsum("iab,tib->tia", responses(problem, state), fields) + state.sensors[:, OFFSET]
-    return readings.reshape(len(fields), -1) + problem.array.channel_offset_T
-
-
-def residuals(problem: CalibrationProblem, state: CalibrationState) -> FloatArray:
-    """Return the whitened residuals of all readings, (T, C); zero where a reading is missing."""
-    difference = prediction_T(problem, state) - problem.readings_T
-    return np.where(np.isfinite(problem.readings_T), difference / (problem.noise_scale * problem.noise_T), 0.0)
-
-
-def chi2(problem: CalibrationProblem, state: CalibrationState) -> float:
-    """Return χ² of the readings, and of the priors of the common field and of the path if there are some."""
-    weight, deviation = row_priors(problem, state)
-    return float(np.sum(residuals(problem, state) ** 2) + np.sum((weight * deviation) ** 2))
-
-
-def cost(problem: CalibrationProblem, state: CalibrationState) -> float:
-    """Return χ² of the readings and of all priors."""
-    return chi2(problem, state) + float(np.sum((state.sensors / problem.prior)[problem.free] ** 2))
-
-
-def linearise(problem: CalibrationProblem, state: CalibrationState) -> Linearisation:
-    """Return the residuals of a state and their derivatives by every unknown."""
-    array = problem.array
-    n_rows, n_sensors = len(state.position_m), array.n_sensors
-    points, sources, moments = _geometry(problem, state)
-    weight = np.where(np.isfinite(problem.readings_T), 1.0 / (problem.noise_scale * problem.noise_T), 0.0)
-    weight = weight.reshape(n_rows, n_sensors, 3, 1)
-    response = weight * responses(problem, state)
-    gradient = response @ dipole.gradient_tensor(points, sources, moments)
-    by_moment = response @ dipole.field_matrix(points, sources)
-    fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
-    nominal = np.einsum("iab,tib->tia", array.channel_gain.reshape(-1, 3, 3), fields)
-
-    by_sensor = np.zeros((n_rows, n_sensors, 3, PER_SENSOR))
-    by_sensor[..., POSITION] = gradient
-    by_sensor[..., GAINS] = nominal[..., None] * np.eye(3)
-    by_sensor[..., _CHANNEL, range(AXES.start, AXES.stop)] = nominal[..., _COMPONENT]
-    by_sensor[..., OFFSET] = np.eye(3)
-    by_sensor[..., GAINS.start :] *= weight
-    by_sensor *= np.where(problem.free, problem.prior, 0.0)[:, None, :]
-
-    array_from_world = np.swapaxes(problem.world_from_array, -1, -2)[:, None]
-    by_world_moment = by_moment @ array_from_world
-    up = -gradient @ array_from_world[..., 2:]
-    none = np.empty((n_rows, n_sensors, 3, 0))
-    by_moments = {"constant": by_world_moment}
-    if problem.axis is not None:
-        by_moments["axis"] = np.einsum("tnab,tb->tna", by_world_moment, problem.axis)[..., None]
-    by_source = [
-        by_moments.get(problem.moment, none),
-        up if problem.unknown_height else none,
-    ]
-    by_row = [
-        -gradient if problem.unknown_position else none,
-        by_world_moment if problem.moment == "free" else none,
-        response,
-    ]
-    shape = (n_rows, array.n_channels)
-    return Linearisation(
-        residual=residuals(problem, state),
-        by_sensor=by_sensor,
-        by_source=np.concatenate(by_source, axis=-1).reshape(*shape, problem.n_globals),
-        by_row=np.concatenate(by_row, axis=-1).reshape(*shape, problem.n_row_unknowns),
-    )
-
-
-def _geometry(problem: CalibrationProblem, state: CalibrationState) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return sensors (N, 3), sources and moments (T, 1, 3), all in the array's frame."""
-    points = problem.array.positions + state.sensors[:, POSITION]
-    array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
-    sources = state.position_m + state.height_m * array_from_world[..., 2]
-    moments = np.einsum("tab,tb->ta", array_from_world, state.moment_Am2)
-    return points, sources[:, None, :], moments[:, None, :]
-
-
-def row_priors(problem: CalibrationProblem, state: CalibrationState) -> tuple[FloatArray, FloatArray]:
-    """Return 1/σ (T, n) of the prior of the rows' unknowns, 0 without a prior, and their deviations (T, n) from it."""
-    weight, deviation = np.zeros((2, len(state.position_m), problem.n_row_unknowns))
-    sigma_T = problem.array.common_field_T
-    weight[:, -3:] = 0.0 if sigma_T is None else 1.0 / max(sigma_T, 1e-15)
-    deviation[:, -3:] = state.common_T
-    if problem.path_m is not None and problem.path_sigma_m is not None:
-        weight[:, :3] = 1.0 / np.maximum(problem.path_sigma_m, _EXACT_M)[:, None]
-        deviation[:, :3] = state.position_m - problem.path_m
-    return weight, deviation
+    def after_step(self, state: CalibrationState, step: FloatArray, of_rows: FloatArray) -> CalibrationState:
+        """Return a state after a step (P,) of sensors and source, and (T, n) of the rows."""
+        n = int(self.free.sum())
+        sensors = state.sensors.copy()
+        sensors[self.free] += self.prior[self.free] * step[:n]
+        position, height, moment = state.position_m, state.height_m, state.moment_Am2
+        if self.unknown_position:
+            # A source that jumps far away would not return, because its field and all derivatives vanish.
+            length = np.linalg.norm(of_rows[:, :3], axis=1, keepdims=True)
+            radius = self.array.circumradius
+            of_rows = of_rows * (radius / np.maximum(length, radius))
+            position = position + of_rows[:, :3]
+        if self.unknown_height:
+            height = height + float(step[-1])
+        if self.moment == "free":
+            moment = moment + of_rows[:, -6:-3]
+        elif self.moment == "constant":
+            moment = moment + step[n : n + 3]
+        elif self.axis is not None:
+            moment = moment + step[n] * self.axis
+        return CalibrationState(sensors, position, height, moment, state.common_T + of_rows[:, -3:])

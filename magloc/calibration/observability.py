@@ -8,20 +8,23 @@ null space of the information matrix, which is described by the gauges where the
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from arrays.typing import FloatArray
-from magloc.calibration.model import (
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.calibration.model import CalibrationProblem, CalibrationState
+from magloc.calibration.sensors import (
     AXES,
     AXIS_PAIRS,
     GAINS,
     OFFSET,
     PER_SENSOR,
     POSITION,
-    CalibrationProblem,
-    CalibrationState,
+    SensorProblem,
+    State,
     responses,
     unknowns,
 )
@@ -43,18 +46,22 @@ class Unobservable:
         Description of the change: one gauge, a combination of gauges, or the unknowns that change most.
     information : float
         Information of the readings, relative to the prior; 0 if they do not depend on it.
+    prior : float
+        Standard deviation that the prior allows: of a gauge in its own unit (m, rad, T, or a fraction), 1 for a
+        direction that mixes unknowns.
     """
 
     name: str
     information: float
+    prior: float = 1.0
 
 
-def gauge_vectors(problem: CalibrationProblem, state: CalibrationState) -> dict[str, FloatArray]:
+def gauge_vectors(problem: SensorProblem[State], state: State) -> dict[str, FloatArray]:
     """Return the sensors' unknowns along every gauge, (N, 15) in prior standard deviations."""
     array, n = problem.array, problem.array.n_sensors
     relative = array.positions + state.sensors[:, POSITION]
     relative = relative - relative.mean(axis=0)
-    response = responses(problem, state)
+    response = responses(array, state.sensors)
     nominal = array.channel_gain.reshape(-1, 3, 3)
     vectors = {}
     for axis, name in enumerate("xyz"):
@@ -70,55 +77,78 @@ def gauge_vectors(problem: CalibrationProblem, state: CalibrationState) -> dict[
     return {name: vector / problem.prior for name, vector in vectors.items()}
 
 
-def unobservable_directions(
+def unobservable_of_source(
     problem: CalibrationProblem, state: CalibrationState, information: FloatArray
 ) -> tuple[Unobservable, ...]:
-    """Return the directions without information in (F, F), the gauges first."""
+    """Return the directions of the sensors' unknowns without information in (F, F), the gauges first."""
+    gauges = {name: vector.ravel() for name, vector in gauge_vectors(problem, state).items()}
+    free = problem.free.ravel()
+    found = unobservable_directions(information, gauges, free, lambda index: unknown_name(problem.array, index))
+    if _mirror_cost(problem, state) < _MIRRORED_WITHIN:
+        found += (Unobservable("mirror image: every position inverted through one point", 0.0),)
+    return found
+
+
+def unobservable_directions(
+    information: FloatArray, gauges: dict[str, FloatArray], free: BoolArray, name_of: Callable[[int], str]
+) -> tuple[Unobservable, ...]:
+    """Return the directions without information in (p, p), the gauges first.
+
+    Parameters
+    ----------
+    information : ndarray, shape (p, p)
+        Information of the readings, in units of the prior's.
+    gauges : dict
+        Changes of all P unknowns along every gauge, (P,) in prior standard deviations.
+    free : ndarray of bool, shape (P,)
+        True for the p unknowns that are estimated.
+    name_of : callable
+        Name of one of the P unknowns.
+    """
     if not len(information):
         return ()
     value, vector = np.linalg.eigh(information)
     limit = max(UNSEEN, _ROUNDING * len(value) * float(value[-1]))
     null = vector[:, value < limit]
-    free = problem.free.ravel()
-    found, seen = [], {}
-    for name, full in gauge_vectors(problem, state).items():
-        whole = full.ravel() / np.linalg.norm(full)
+    found, units, seen = [], [], {}
+    for name, full in gauges.items():
+        length = float(np.linalg.norm(full))
+        whole = full / length
         unit = whole[free]
         told = float(unit @ information @ unit)
         held = np.linalg.norm(unit) < 1.0 - 1e-6  # a part of it is trusted or not estimated
         if held or told >= limit:
             seen[name] = whole
         else:
-            found.append(Unobservable(name, max(0.0, told)))
-            null = null - np.outer(unit, unit @ null)
+            found.append(Unobservable(name, max(0.0, told), 1.0 / length))
+            units.append(unit)
+    if units:
+        basis, _ = np.linalg.qr(np.stack(units, axis=1))
+        null = null - basis @ (basis.T @ null)
     left, size, _ = np.linalg.svd(null, full_matrices=False)
     for direction in left[:, size > 0.5].T:
         told = float(direction @ information @ direction)
-        found.append(Unobservable(_describe(problem, direction, seen), max(0.0, told)))
-    if _mirror_cost(problem, state) < _MIRRORED_WITHIN:
-        found.append(Unobservable("mirror image: every position inverted through one point", 0.0))
+        whole = np.zeros(len(free))
+        whole[free] = direction
+        found.append(Unobservable(_describe(whole, seen, name_of), max(0.0, told)))
     return tuple(found)
 
 
-def _describe(problem: CalibrationProblem, direction: FloatArray, gauges: dict[str, FloatArray]) -> str:
-    """Describe a direction by gauges, else by the unknowns that change most."""
-    whole = np.zeros(problem.free.size)
-    whole[problem.free.ravel()] = direction
+def _describe(whole: FloatArray, gauges: dict[str, FloatArray], name_of: Callable[[int], str]) -> str:
+    """Describe a direction (P,) by gauges, else by the unknowns that change most."""
     if gauges:
         columns = np.stack(list(gauges.values()), axis=1)
         share, *_ = np.linalg.lstsq(columns, whole, rcond=None)
         if np.linalg.norm(columns @ share - whole) < _UNEXPLAINED:
             taking_part = np.flatnonzero(np.abs(share) > 0.1 * np.abs(share).max())
             return "combination of " + ", ".join(list(gauges)[k] for k in taking_part)
-    where = np.flatnonzero(problem.free.ravel())
-    largest = where[np.argsort(-np.abs(direction))[:3]]
-    return "mostly " + ", ".join(unknown_name(problem, int(k)) for k in largest)
+    return "mostly " + ", ".join(name_of(int(k)) for k in np.argsort(-np.abs(whole))[:3])
 
 
-def unknown_name(problem: CalibrationProblem, index: int) -> str:
+def unknown_name(array: SensorArray, index: int) -> str:
     """Return the name of one of the sensors' 15 N unknowns, as ``s1 position x``."""
     sensor, k = divmod(index, PER_SENSOR)
-    name = problem.array.ids[sensor]
+    name = array.ids[sensor]
     if k < AXES.start:
         return f"{name} {'position' if k < GAINS.start else 'gain'} {'xyz'[k % 3]}"
     if k >= OFFSET.start:

@@ -16,6 +16,7 @@ from magloc.cli.options import STREAM, Port, naming_outputs
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
+    from magloc.bodies.body import MagnetBody
     from magloc.localization.fit.fixes import Fixes
     from magloc.readings import Readings
     from magloc.viewer.pages.open_result import ReadingsResult, Result
@@ -28,6 +29,7 @@ def view(
     *,
     array: Path | None = None,
     readings: Path | None = None,
+    body: Path | None = None,
     html: Path | None = None,
     png: Path | None = None,
     movie: Path | None = None,
@@ -49,6 +51,8 @@ def view(
         Array file of readings or of a track; for readings by default NAME-array.toml or array.toml in their folder.
     readings : Path
         Readings file (CSV) of a track.
+    body : Path
+        Body file (TOML) of readings: its pose is found in every row, and its magnets are shown as they turn.
     html : Path
         HTML file to write; it needs no server.
     png : Path
@@ -80,7 +84,10 @@ def view(
     sensors, rows = _with_track(result, array, readings)
     file = path if isinstance(result, arrays.SensorArray) else None
     shown: Any = result
-    if isinstance(result, ReadingsResult):
+    magnets = None if body is None else _read_body(body, result)
+    if isinstance(result, ReadingsResult) and magnets is not None:
+        sensors, shown = result.array, result.readings
+    elif isinstance(result, ReadingsResult):
         sensors, (shown, rows) = result.array, _fixes(result)
     elif isinstance(result, arrays.SensorArray):
         sensors, shown = result, None
@@ -89,10 +96,29 @@ def view(
 
     def scene(port: int) -> View:
         return magloc.view(
-            sensors, shown, readings=rows, html=html, png=png, movie=movie, open=open, port=port, title=title, file=file
+            sensors,
+            shown,
+            body=magnets,
+            readings=rows,
+            html=html,
+            png=png,
+            movie=movie,
+            open=open,
+            port=port,
+            title=title,
+            file=file,
         )
 
     write_or_serve(scene, written, port)
+
+
+def _read_body(path: Path, result: Result) -> MagnetBody:
+    from magloc.bodies.body_file import read_body
+    from magloc.viewer.pages.open_result import ReadingsResult
+
+    if not isinstance(result, ReadingsResult):
+        raise InputError(f"--body {path}: found without readings, expected a readings file.")
+    return read_body(path)
 
 
 def write_or_serve(scene: Callable[[int], View], written: Sequence[str], port: int) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from arrays.io.csv import Column
-from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, POSITION
+from magloc.calibration.bodies.results import BodyCalibration
 from magloc.calibration.results import SourceCalibration, TurningCalibration
+from magloc.calibration.sensors import AXES, AXIS_PAIRS, GAINS, OFFSET, POSITION
 from magloc.plots import style
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ from arrays.typing import FloatArray
 _T_IN_nT = 1e9
 
 
-def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
+def calibration(result: SourceCalibration | BodyCalibration | TurningCalibration) -> Figure:
     """Draw a calibration.
 
     Parameters
@@ -44,12 +45,12 @@ def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
     return turning_figure(result) if isinstance(result, TurningCalibration) else calibration_figure(result)
 
 
-def columns_of_calibration(result: SourceCalibration | TurningCalibration) -> dict[str, Column]:
+def columns_of_calibration(result: SourceCalibration | BodyCalibration | TurningCalibration) -> dict[str, Column]:
     """Return the data of the figure as columns."""
     return turning_columns(result) if isinstance(result, TurningCalibration) else calibration_columns(result)
 
 
-def calibration_columns(result: SourceCalibration) -> dict[str, Column]:
+def calibration_columns(result: SourceCalibration | BodyCalibration) -> dict[str, Column]:
     """Return the data of :func:`calibration_figure` as columns."""
     before, after = result.rms_T
     axes = [f"axis_{'xyz'[channel]}_to_{'xyz'[component]}" for channel, component in AXIS_PAIRS]
@@ -88,7 +89,7 @@ _GROUPS = (
 )
 
 
-def calibration_figure(result: SourceCalibration) -> Figure:
+def calibration_figure(result: SourceCalibration | BodyCalibration) -> Figure:
     """Draw the residuals of every sensor before and after, and the changes of the array file.
 
     Estimated positions, gains, axes and offsets have a panel each. The bars are 95 % intervals.

@@ -20,12 +20,11 @@ from arrays.io.text import write_text
 from arrays.typing import FloatArray
 from magloc.navigation.poses import rotations_at, unit_rotation
 from magloc.readings import Readings
-from magloc.truth import TRUE_POSITION_COLUMNS, Truth, truth_of_rows
+from magloc.truth import TRUE_POSITION_COLUMNS, TRUE_ROTATION_COLUMNS, Truth, truth_of_rows
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-PATH_ROTATION_COLUMNS = ("qx", "qy", "qz", "qw")
 _SLOWEST_M_S = 1e-3
 _EXPECTED = "a header with time_s, x_m, y_m and z_m"
 
@@ -172,12 +171,12 @@ def read_object_path(path: str | PathLike[str]) -> ObjectPath:
     (2, 3)
     """
     table = read_table(path, _EXPECTED)
-    known = ("time_s", *TRUE_POSITION_COLUMNS, *PATH_ROTATION_COLUMNS)
+    known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_ROTATION_COLUMNS)
     for name in known[:4]:
         table.require(name, known)
     table.refuse_unknown(known)
     time_s = table.times()
-    rotation = unit_rotation(table, PATH_ROTATION_COLUMNS) if table.has_group(PATH_ROTATION_COLUMNS) else None
+    rotation = unit_rotation(table, TRUE_ROTATION_COLUMNS) if table.has_group(TRUE_ROTATION_COLUMNS) else None
     return ObjectPath(time_s, table.complete(TRUE_POSITION_COLUMNS), rotation, str(path))
 
 
@@ -186,7 +185,7 @@ def write_object_path(path: str | PathLike[str], known: ObjectPath) -> None:
     header = ["time_s", *TRUE_POSITION_COLUMNS]
     columns = [known.time_s[:, None], known.position_m]
     if known.rotation is not None:
-        header += PATH_ROTATION_COLUMNS
+        header += TRUE_ROTATION_COLUMNS
         columns.append(known.rotation.as_quat())
     rows = (",".join(map(repr, row)) for row in np.hstack(columns).tolist())
     write_text("\n".join([",".join(header), *rows, ""]), path)

@@ -276,12 +276,15 @@ class TrackResult:
         Ids of several sources; empty for one source.
     others : tuple of tuple of TrackPoint
         Points of the further sources, in the same rows.
+    kind : str
+        Word for a source.
     """
 
     points: tuple[TrackPoint, ...]
     is_truth: bool
     ids: tuple[int, ...] = ()
     others: tuple[tuple[TrackPoint, ...], ...] = ()
+    kind: str = "source"
 
     @property
     def tracks(self) -> tuple[tuple[TrackPoint, ...], ...]:

@@ -39,8 +39,12 @@ from magloc.viewer.server import (
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magloc.bodies.body import MagnetBody
+    from magloc.bodies.poses import BodyPoses
     from magloc.tracking.multi_target.track import SourcesTrack
     from magloc.tracking.track import Track
+
+    Shown = Readings | Fixes | Track | SourcesTrack | TrackResult | Truth | BodyPoses | Survey | xr.Dataset | MapResult
 
 _MOST_ROWS = 2000
 _INLINE_PX = 560
@@ -95,9 +99,20 @@ class View(Closing):
 def view(
     array: SensorArray | None,
     result: (
-        Readings | Fixes | Track | SourcesTrack | TrackResult | Truth | Survey | xr.Dataset | MapResult | None
+        Readings
+        | Fixes
+        | Track
+        | SourcesTrack
+        | TrackResult
+        | Truth
+        | BodyPoses
+        | Survey
+        | xr.Dataset
+        | MapResult
+        | None
     ) = None,
     *,
+    body: MagnetBody | None = None,
     readings: Readings | None = None,
     html: str | Path | None = None,
     png: str | Path | None = None,
@@ -117,9 +132,11 @@ def view(
     ----------
     array : SensorArray, optional
         None for a map, a Survey or a Track, which have their own array, and for a path without an array.
-    result : Readings, Fixes, Track, SourcesTrack, TrackResult, Truth, Survey or xarray.Dataset, optional
+    result : Readings, Fixes, Track, SourcesTrack, TrackResult, Truth, BodyPoses, Survey or xarray.Dataset, optional
         Result for the array; a Dataset is a map over starts or sources. Readings are located first, at most 2000 rows,
         evenly spaced. Without a result the page shows the array, with a dipole that the user can drag.
+    body : MagnetBody, optional
+        Body of poses, or of readings, whose magnets are shown as they turn.
     readings : Readings, optional
         Rows of the fixes, or of a track without its own rows, for their plot and the array's poses.
     html, png : path, optional
@@ -158,6 +175,8 @@ def view(
     """
     check_outputs(html, png, movie)
     live = not _is_static(html, png, movie)
+    if body is not None:
+        result, readings = _magnets(array, body, result, readings)
     fill = _choose_page(array, result, readings, progress, None if file is None else Path(file), live=live)
     name = title or (array.name if array is not None else "") or "view"
     return open_view(f"magloc · {name}", fill, html=html, png=png, movie=movie, open=open, port=port)
@@ -218,6 +237,25 @@ def _in_notebook() -> bool:
     """Return whether this process is the kernel of a notebook."""
     kernel = sys.modules.get("ipykernel.kernelapp")
     return kernel is not None and bool(kernel.IPKernelApp.initialized())
+
+
+def _magnets(
+    array: SensorArray | None, body: MagnetBody, result: Any, readings: Readings | None
+) -> tuple[TrackResult, Readings | None]:
+    """Return the tracks of a body's magnets, and the rows."""
+    from magloc.bodies.locator import BodyLocator
+    from magloc.viewer.scene.magnet_tracks import magnet_tracks
+
+    if isinstance(result, Readings):
+        if array is None:
+            raise ValueError("Input array must be the array of the readings; instead received None.")
+        readings = thin_readings(result)
+        result = BodyLocator(array, body).fit_rows(readings.values_T, time_s=readings.time_s)
+    if not hasattr(result, "n_poses"):
+        raise ValueError(
+            f"Input result must be readings or poses where a body is given; instead received {type(result).__name__}."
+        )
+    return magnet_tracks(body, result), readings
 
 
 def _choose_page(

@@ -16,7 +16,7 @@ from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from magloc.readings import write_readings
 from magloc.signature.path import write_object_path
-from magloc.truth import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, Truth
+from magloc.truth import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, TRUE_ROTATION_COLUMNS, Truth
 from sims.magnetics.simulation import Simulation
 
 _TARGET_COLUMNS = (*TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)
@@ -122,5 +122,12 @@ def write_truth(truth: Truth, path: str | PathLike[str]) -> None:
     if truth.moment_Am2 is not None:
         header += TRUE_MOMENT_COLUMNS
         columns.append(truth.moment_Am2)
+    if truth.rotation is not None:
+        header += TRUE_ROTATION_COLUMNS
+        columns.append(truth.rotation.as_quat())
+    for name, sigma in (("sigma_m", truth.sigma_m), ("sigma_deg", truth.sigma_rad)):
+        if sigma is not None:
+            header.append(name)
+            columns.append(sigma[:, None] if name == "sigma_m" else np.degrees(sigma)[:, None])
     rows = (",".join(map(repr, row)) for row in np.hstack(columns).tolist())
     write_text("\n".join([",".join(header), *rows, ""]), path)

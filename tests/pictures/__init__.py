@@ -250,6 +250,7 @@ PICTURES: dict[str, Picture] = {
         ("adcs/plots/complementary.py", STYLE),
     ),
     "residuals-faulty.png": OfPage("sensor-faults", ("magloc/plots/localization.py", STYLE)),
+    "joystick.png": OfPage("joystick", ("magloc/plots/calibrations.py", STYLE)),
     "hall-board.png": OfPage("hall-board", ("magloc/plots/tracks.py", STYLE)),
     "compensation.png": OfPage("compensation", ("magloc/plots/compensations.py", STYLE)),
     "drone-compass.png": OfPage("drone-compass", ("adcs/plots/vehicle_calibration.py", STYLE)),

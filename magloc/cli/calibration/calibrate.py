@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,15 +13,23 @@ import arrays
 import magloc
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_unwritable, write_files
-from arrays.io.tables import align
+from magloc.cli.calibration.by_body import BodyOptions, CalibratedFiles, calibrate_body
+from magloc.cli.calibration.sensors import (
+    PriorOptions,
+    calibration_files,
+    sensor_entries,
+    sensor_prior,
+    sensor_table,
+    unobservable_entries,
+)
 from magloc.cli.framework import CommonOptions, Flag, note, print_result, warn
-from magloc.cli.options import array_of_several, refuse_not_positive
+from magloc.cli.options import array_of_several
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.calibration.array import CalibrationPrior
     from magloc.calibration.cross_validation import CrossValidation
-    from magloc.calibration.results import SourceCalibration, TurningCalibration
+    from magloc.calibration.results import SourceCalibration
     from magloc.readings import Readings
     from magloc.truth import Truth
 
@@ -35,50 +41,18 @@ _ALIKE = 0.1  # largest difference of gains that have one cause
 _COMPARED = 300  # largest number of rows that are located to compare the truth with
 
 
-@Parameter(name="*", group="What is known of the array")
-@dataclass(frozen=True)
-class PriorOptions:
-    """Accuracy of the array file before the calibration.
-
-    Parameters
-    ----------
-    estimate : str
-        Quantities to estimate: some of positions, gains, axes, offsets, separated by commas. The others
-        stay as in the array file.
-    trust_position : str
-        Ids of sensors, separated by commas, whose positions in the array file are exact.
-    trust_scale : str
-        Ids of sensors, separated by commas, whose gains and axes in the array file are exact.
-    position_prior_mm : float
-        Standard deviation of a position in the array file, per axis [mm].
-    gain_prior : float
-        Standard deviation of a gain in the array file (0.2 = 20 %).
-    axes_prior_deg : float
-        Standard deviation of the direction of a channel [°].
-    offset_prior_nT : float
-        Standard deviation of an offset [nT].
-    """
-
-    estimate: str = "positions,gains,axes,offsets"
-    trust_position: str = ""
-    trust_scale: str = ""
-    position_prior_mm: float = 5.0
-    gain_prior: float = 0.2
-    axes_prior_deg: float = 3.0
-    offset_prior_nT: Annotated[float, Parameter(name="--offset-prior-nT")] = 1e5
-
-
 def calibrate(
     readings: Path,
     /,
     *,
     array: Path,
-    out: Path,
+    out: Annotated[Path | None, Parameter(name=("--out", "--out-array"))] = None,
     truth: Path | None = None,
     modulus_nT: Annotated[str | None, Parameter(name="--modulus-nT", allow_leading_hyphen=True)] = None,
     height_m: float | None = None,
     moment: Literal["constant", "free"] | None = None,
-    known: PriorOptions = PriorOptions(),
+    known: PriorOptions = PriorOptions(),  # noqa: B008 - frozen
+    of_body: BodyOptions = BodyOptions(),  # noqa: B008 - frozen
     figures: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
@@ -93,6 +67,9 @@ def calibrate(
     With --modulus-nT there is no source: every sensor was turned in a uniform field of that modulus. This determines
     the gains, the angles between the axes and the offsets of each sensor, but not how it is mounted.
 
+    With --body a rigid body of several magnets moves near the sensors, and its magnets are estimated too. Its poses are
+    those of --truth, unknown, or both (--free-rows).
+
     Parameters
     ----------
     readings : Path
@@ -100,11 +77,12 @@ def calibrate(
     array : Path
         Array file (TOML) to start from. Its noise weights the readings. Set noise_fraction when the source comes near.
     out : Path
-        Array file to write. Nothing is written if the calibration fails.
+        Array file to write; it may be omitted with --body only. Nothing is written if the calibration fails.
     truth : Path
         Truth file (CSV) of the source. Its rows belong to the readings of the same time. Without z_m one height is
         estimated for all rows. Moments in it are taken as known; with axis_x, axis_y, axis_z one strength is estimated.
         sigma_m is the error of its positions. Rows are left out in turn to say how well the calibration carries over.
+        With --body it has the attitude qx, qy, qz, qw too, and sigma_deg is its error.
     modulus_nT : str
         Modulus of the uniform field in which the sensors were turned [nT]: a number, or a CSV file with time_s and
         modulus_nT, such as that of a base station, which is interpolated linearly.
@@ -115,6 +93,8 @@ def calibrate(
         constant.
     known : PriorOptions
         Accuracy of the array file.
+    of_body : BodyOptions
+        Body of several magnets.
     figures : Path
         Folder for figures and their data: residuals before and after, and the changes of the calibration.
     json : bool
@@ -128,6 +108,13 @@ def calibrate(
 
     refuse_unwritable(out, "--out")
     refuse_file(figures, "--figures")
+    if of_body != BodyOptions():
+        if modulus_nT is not None or height_m is not None or moment is not None:
+            raise InputError("--body: found together with --modulus-nT, --height-m or --moment, expected none of them.")
+        calibrate_body(readings, CalibratedFiles(array, out, truth, figures), known, of_body, as_json=json)
+        return
+    if out is None:
+        raise InputError("--out: found none, expected the array file to write.")
     if modulus_nT is not None:
         if truth is not None:
             raise InputError("--modulus-nT: found together with --truth, expected one of them.")
@@ -139,7 +126,7 @@ def calibrate(
             result = magloc.calibrate(nominal, rows, modulus_T=turning.modulus_of(modulus_nT, rows))
     else:
         nominal = array_of_several(array)
-        prior = _prior(known, nominal, array)
+        prior = sensor_prior(known, nominal, array)
         rows = read_readings(readings, nominal)
         path = _path(rows, truth, height_m, readings)
         _compare_with_fixes(nominal, rows, path)
@@ -151,7 +138,7 @@ def calibrate(
         report, lines, notes = turning.report(result, out), turning.lines(result), turning.notes(result)
     else:
         _check_converged(result, readings, out)
-        report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
+        report, lines, notes = _report(result, len(rows), out), sensor_table(result), _notes(result, len(rows), prior)
         if moment is None and (path is None or (path.moment_Am2 is None and path.axis is None)):
             notes += _turn_notes(result)
         report["cross_validation"] = None
@@ -161,7 +148,7 @@ def calibrate(
             notes += _validation_notes(validation, background)
     arrays.write_array(out, result.array)
     print_result(report, lines, as_json=json)
-    write_files(figures, _files(result), "--figures")
+    write_files(figures, calibration_files(result), "--figures")
     for line in [] if json else notes:
         note(line)
 
@@ -208,45 +195,6 @@ def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> No
         )
 
 
-def _files(result: SourceCalibration | TurningCalibration) -> Iterator[tuple[str, Any]]:
-    """Yield the figure of a calibration, and the data behind it."""
-    from magloc.calibration.results import TurningCalibration
-    from magloc.plots.calibrations import columns_of_calibration
-
-    name = "turning" if isinstance(result, TurningCalibration) else "calibration"
-    yield f"{name}.png", result.plot()
-    yield f"{name}.csv", columns_of_calibration(result)
-
-
-def _prior(options: PriorOptions, array: SensorArray, path: Path) -> CalibrationPrior:
-    from magloc.calibration.array import QUANTITIES
-
-    quantities = _names(options.estimate)
-    for name in quantities or [""]:
-        if name not in QUANTITIES:
-            raise InputError(f"--estimate: found {name!r}, expected some of {', '.join(QUANTITIES)}.")
-    for option, ids in (("--trust-position", options.trust_position), ("--trust-scale", options.trust_scale)):
-        for name in _names(ids):
-            if name not in array.ids:
-                raise InputError(
-                    f"{option}: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}."
-                )
-    refuse_not_positive(options, "position_prior_mm", "gain_prior", "axes_prior_deg", "offset_prior_nT")
-    return magloc.CalibrationPrior(
-        position_m=options.position_prior_mm * 1e-3,
-        gain=options.gain_prior,
-        axes_rad=math.radians(options.axes_prior_deg),
-        offset_T=options.offset_prior_nT * 1e-9,
-        estimate=tuple(quantity for quantity in QUANTITIES if quantity in quantities),
-        trusted_positions=tuple(_names(options.trust_position)),
-        trusted_scales=tuple(_names(options.trust_scale)),
-    )
-
-
-def _names(text: str) -> list[str]:
-    return [name.strip() for name in text.split(",")] if text else []
-
-
 def _path(readings: Readings, path: Path | None, height_m: float | None, readings_path: Path) -> Truth | None:
     """Read the path of the source; a missing z becomes the height, if one is given."""
     import numpy as np
@@ -287,22 +235,6 @@ def _compare_with_fixes(array: SensorArray, rows: Readings, path: Truth | None) 
 
 def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]:
     """Return the report that ``--json`` prints."""
-    from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
-
-    sensors = [
-        {
-            "id": sensor.id,
-            "position_m": sensor.position_m,
-            "position_sd_m": sd[POSITION],
-            "scale": sensor.calibration.scale,
-            "gain_sd": sd[GAINS],
-            "axes_sd_rad": sd[AXES],
-            "offset_nT": [1e9 * offset for offset in sensor.calibration.offset_T],
-            "offset_sd_nT": 1e9 * sd[OFFSET],
-            "residual_rms_nT": 1e9 * rms,
-        }
-        for sensor, sd, rms in zip(result.array.sensors, result.sigma, result.residual_rms_T.tolist(), strict=True)
-    ]
     constant = bool((result.moment_Am2 == result.moment_Am2[0]).all())
     return {
         "out": str(out),
@@ -315,30 +247,9 @@ def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]
         "iterations": result.iterations,
         "converged": result.converged,
         "moment_Am2": result.moment_Am2[0] if constant else None,
-        "sensors": sensors,
-        "unobservable": [{"name": u.name, "information": u.information} for u in result.unobservable],
+        "sensors": sensor_entries(result),
+        "unobservable": unobservable_entries(result),
     }
-
-
-def _table(result: SourceCalibration) -> list[str]:
-    """Return the changes of every sensor, with the largest standard deviation of each group."""
-    import numpy as np
-
-    from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
-    from magloc.cli.calibration import by_turning as turning
-
-    rows = [["sensor", "position mm", "s", "gain %", "s", "axes °", "s", "offset µT", "s", "rms nT", ""]]
-    for sensor, change, sd, rms in zip(
-        result.array.ids, result.change, result.sigma, result.residual_rms_T, strict=True
-    ):
-        cells = [
-            *turning.values_by_sigma(1e3 * change[POSITION], 1e3 * sd[POSITION]),
-            *turning.values_by_sigma(100.0 * change[GAINS], 100.0 * sd[GAINS]),
-            *turning.values_by_sigma(np.degrees(np.abs(change[AXES]).max(keepdims=True)), np.degrees(sd[AXES])),
-            *turning.values_by_sigma(1e6 * change[OFFSET], 1e6 * sd[OFFSET]),
-        ]
-        rows.append([sensor, *cells, f"{1e9 * rms:.1f}", ""])
-    return align(rows, left=1)
 
 
 def _turn_notes(result: SourceCalibration) -> list[str]:
@@ -356,7 +267,7 @@ def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> l
     """Return notes on rows and χ², on undetermined directions, and on sensors with absurd gains."""
     import numpy as np
 
-    from magloc.calibration.model import GAINS
+    from magloc.calibration.sensors import GAINS
 
     notes = [
         f"{int(result.rows.sum())} of {n_rows} rows used; χ² {result.chi2_before:.4g} with {result.dof_before:.0f} "

@@ -254,10 +254,11 @@ def track_page(
 
 def _line_entries(result: TrackResult, name: str) -> list[Entry]:
     """Return the entries of the legend for tracks: a single one by time, several by source."""
-    ellipsoids = "" if result.is_truth else ", with 95 % ellipsoids"
+    has_any = any(point.covariance is not None for track in result.tracks for point in track)
+    ellipsoids = ", with 95 % ellipsoids" if has_any else ""
     if result.ids:
         sources = zip(result.ids, source_colours(result), strict=True)
-        return [Swatch(colour, f"source {id}{ellipsoids}") for id, colour in sources if colour is not None]
+        return [Swatch(colour, f"{result.kind} {id}{ellipsoids}") for id, colour in sources if colour is not None]
     first, last = (f"{result.points[i].time_s:.6g} s" for i in (0, -1))
     return [ColourScale.sample(f"{name}{ellipsoids}, by time", first, last, time_colours)]
 

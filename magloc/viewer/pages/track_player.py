@@ -248,7 +248,7 @@ def row_html(result: TrackResult, index: int) -> str:
     if not result.ids:
         return point_html(result.points[index], time)
     now = [(id, track[index]) for id, track in zip(result.ids, result.tracks, strict=True)]
-    known = [point_html(point, f"source {id}") for id, point in now if point.position_m is not None]
+    known = [point_html(point, f"{result.kind} {id}") for id, point in now if point.position_m is not None]
     return "".join([texts.panel_html([time]), *known])
 
 

@@ -18,12 +18,12 @@ from arrays.array_file import read_array
 from arrays.geometries import tetrahedron
 from arrays.sensor import Calibration, Sensor
 from magloc.calibration import least_squares as source_fit
-from magloc.calibration import model as moving_source
 from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
 from magloc.calibration.continuation import apply_calibration
-from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION, CalibrationProblem, CalibrationState
+from magloc.calibration.model import CalibrationProblem, CalibrationState, MomentKind
 from magloc.calibration.observability import gauge_vectors
 from magloc.calibration.results import SourceCalibration
+from magloc.calibration.sensors import AXES, GAINS, OFFSET, POSITION
 from magloc.readings import read_readings
 from magloc.truth import read_truth
 from tests.oracles import magpylib_field
@@ -123,7 +123,7 @@ def assert_recovered(result: SourceCalibration, case: Passage, *, within: float)
 
 
 def problem_of(
-    case: Passage, *, unknown_position: bool, unknown_height: bool, moment: moving_source.MomentKind
+    case: Passage, *, unknown_position: bool, unknown_height: bool, moment: MomentKind
 ) -> CalibrationProblem:
     """With a moment of known direction the path is measured with errors too."""
     n = len(case.position_m)
@@ -180,11 +180,11 @@ class TestDerivatives:
         state = state_of(turning)
         estimated, g, k = problem.estimated_indices.tolist(), problem.n_globals, problem.n_row_unknowns
         n = problem.free.size
-        linear = moving_source.linearise(problem, state)
+        linear = problem.linearise(state)
         n_rows, n_channels = linear.residual.shape
 
         def residual(step: FloatArray, rows: FloatArray) -> FloatArray:
-            return moving_source.residuals(problem, source_fit.apply_step(problem, state, step, rows))
+            return problem.residuals(problem.prediction_T(problem.after_step(state, step, rows)))
 
         def slope(along: Callable[[float], FloatArray], h: float) -> FloatArray:
             return (along(h) - along(-h)) / (2.0 * h)
@@ -219,7 +219,7 @@ class TestDerivatives:
         case = replace(turning, array=replace(turning.array, common_field_T=common_field_T))
         problem = problem_of(case, unknown_position=unknown_position, unknown_height=unknown_height, moment=moment)
         state = state_of(case)
-        linear = moving_source.linearise(problem, state)
+        linear = problem.linearise(state)
         n_rows, n_channels, k = linear.by_row.shape
         n, g = problem.free.size, problem.n_globals
         dense = np.zeros((n_rows, n_channels, n + g + n_rows * k))
@@ -385,9 +385,7 @@ class TestSelfCalibration:
             np.tile(scale**3 * turn @ MOMENT, (60, 1)),
             np.zeros((60, 3)),
         )
-        np.testing.assert_allclose(
-            moving_source.prediction_T(moved, other), moving_source.prediction_T(problem, state), rtol=1e-9, atol=1e-16
-        )
+        np.testing.assert_allclose(moved.prediction_T(other), problem.prediction_T(state), rtol=1e-9, atol=1e-16)
         names = set(gauge_vectors(problem, state))
         assert names == TRANSLATIONS | ROTATIONS | SIZE | GAIN | COMMON_OFFSETS
 
@@ -406,8 +404,8 @@ class TestSelfCalibration:
         )
         mirrored = replace(problem, array=replace(case.true_array, sensors=inverted))
         np.testing.assert_allclose(
-            moving_source.prediction_T(mirrored, replace(state, sensors=0 * case.change, position_m=-case.position_m)),
-            moving_source.prediction_T(problem, state),
+            mirrored.prediction_T(replace(state, sensors=0 * case.change, position_m=-case.position_m)),
+            problem.prediction_T(state),
             rtol=1e-9,
             atol=1e-16,
         )

@@ -1,0 +1,1 @@
+"""Calibration of a body's magnets together with the sensors."""
