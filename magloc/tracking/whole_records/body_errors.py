@@ -15,6 +15,7 @@ import numpy as np
 from arrays.typing import FloatArray
 from magloc.fields.multipole import DEFAULT_LENGTH, N_BODY_ERRORS, finite_body_errors
 from magloc.measurement.differences import fields_at_sensors
+from magloc.measurement.magnet import magnet_of
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import TrackPoint
@@ -32,9 +33,11 @@ _NEGLIGIBLE = 1e-2
 def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> float:
     """Return the ratio of the rms error of the last row, for a body, to its standard deviation.
 
-    It is NaN if the range is not known. The body does not turn. Its length is a quarter of the least distance of the
-    source from a sensor.
+    It is NaN if the range is not known, and 1 of a magnet of known shape. The body does not turn. Its length is a
+    quarter of the least distance of the source from a sensor.
     """
+    if magnet_of(tracker.array) is not None:
+        return 1.0
     used = placed_rows(points)[-_MOST_ROWS:]
     measured = ((tracker.measurements.of(rows[row.index]), row.source) for row in used)
     seen = [(measurement, source) for measurement, source in measured if measurement.z.size]

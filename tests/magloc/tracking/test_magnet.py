@@ -33,6 +33,7 @@ def test_nees_at_a_gap_of_half_a_length(shape: Shape, smooth: bool) -> None:
         array, Readings(values, time_s=DT_S * np.arange(200)), motion=motion, magnet=shape, smooth=smooth
     )
     assert track.tracked.all()
+    assert track.innovations.body_factor == 1.0
     off = np.concatenate([track.position_m, track.moment_Am2], axis=1) - truth
     assert 0.8 < nees_per_dimension(off, track.covariance[:, :6, :6]).mean() < 1.3
     assert np.linalg.norm(off[:, :3].mean(axis=0)) < 0.02e-3
