@@ -11,13 +11,24 @@ from magloc import core
 from tests.test_core_examples import COMPILER
 
 
-def check_random_updates(source: Path, count: int, folder: Path) -> None:
+def check_random_updates(source: Path, count: int, folder: Path, optimisation: str = "-O1") -> None:
     """Run a program with so many updates in double and in float, and check the counts that it prints."""
     if COMPILER is None:
         pytest.skip("no C++ compiler")
     program = folder / "random_updates"
     includes = [f"-I{core.include_dir()}", f"-I{Path(__file__).parent}"]
-    command = [COMPILER, "-std=c++17", "-O0", *includes, "-Wall", "-Wextra", "-Werror", str(source), "-o", str(program)]
+    command = [
+        COMPILER,
+        "-std=c++17",
+        optimisation,
+        *includes,
+        "-Wall",
+        "-Wextra",
+        "-Werror",
+        str(source),
+        "-o",
+        str(program),
+    ]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     if subprocess.run([*command, *sanitizers], check=False, capture_output=True).returncode:
         subprocess.run(command, check=True)
