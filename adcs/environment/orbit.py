@@ -162,11 +162,11 @@ def circular_orbit(
 def node_of_local_time(local_time_h: float, date: Dates) -> float:
     """Return the right ascension of an ascending node with a mean solar time, LTAN, at a date [rad, 0 to 2π].
 
-    The mean Sun is 12 h minus UT away from Greenwich, whose right ascension in eci is the Earth rotation angle.
+    The mean Sun is 12 h minus UT away from Greenwich, whose right ascension is the mean sidereal time.
     ``local_time_h``: local mean solar time at the node [h]. ``date``: UTC.
     """
     day, fraction = julian_dates(instants(date))
-    greenwich = float(pyerfa().era00(day, fraction))
+    greenwich = float(pyerfa().gmst82(day, fraction))
     since_midnight = float(day + 0.5 + fraction) % 1.0
     return (greenwich + 2.0 * math.pi * (local_time_h / 24.0 - since_midnight)) % (2.0 * math.pi)
 

@@ -74,14 +74,6 @@ class TestCircularOrbit:
             behind = (node_of_local_time(15.0, date) - np.arctan2(sun[1], sun[0]) - np.radians(45.0)) % (2 * np.pi)
             assert min(behind, 2 * np.pi - behind) < np.radians(4.6)
 
-    @pytest.mark.parametrize("date", ["2008-03-01", "2026-11-21T23:00"])
-    def test_longitude_at_the_node(self, date: str) -> None:
-        """Local mean time is UT plus the longitude, to 0.01°."""
-        node = node_of_local_time(15.0, date)
-        x, y, _ = R_ecef_from_eci(instants(date)) @ [np.cos(node), np.sin(node), 0.0]
-        hours = instants(date).astype("datetime64[s]").astype(int) % 86400 / 3600 + np.degrees(np.arctan2(y, x)) / 15.0
-        assert (hours - 15.0 + 12.0) % 24.0 - 12.0 == pytest.approx(0.0, abs=0.01 / 15.0)
-
     @pytest.mark.parametrize(("altitude", "inclination"), [(0.0, 1.0), (-5.0, 1.0), (np.inf, 1.0), (6e5, np.nan)])
     def test_bad_elements(self, altitude: float, inclination: float) -> None:
         with pytest.raises(ValueError, match=r"Input (altitude_m|inclination_rad) must be .*; instead received"):
