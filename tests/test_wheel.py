@@ -73,7 +73,7 @@ class TestWheel:
     def test_has_every_file_of_the_packages(self, wheel: dict[str, bytes]) -> None:
         wanted = {name for name in names() if name.startswith(tuple(f"{package}/" for package in PACKAGES))}
         wanted = {name for name in wanted if not name.endswith(ONLY_TO_BUILD)}
-        kinds = {".py", ".pyi", ".toml", ".csv", ".obj", ".typed", ".h", ".hpp"}
+        kinds = {".py", ".pyi", ".toml", ".csv", ".obj", ".typed", ".h", ".hpp", ".cmake"}
         assert {Path(name).suffix for name in wanted} == kinds
         inside = {name for name in wheel if ".dist-info/" not in name}
         assert {name for name in inside if not name.startswith(LIBRARY)} == wanted

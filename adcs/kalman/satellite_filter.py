@@ -234,6 +234,7 @@ class SatelliteFilter:
                 f"{before.last_s:.17g} s. Skip the row."
             )
         is_late = time_s - before.last_s > max(self.longest_gap_s, self.step_s)
+        is_restarted = is_late and bool(before.n_taken)
         if is_late:
             before = _Progress()
         record = self._record(time_s, before, row.readings, row.star_covariance_rad2)
@@ -247,7 +248,7 @@ class SatelliteFilter:
             read_s=np.where(seen | ~np.isfinite(before.read_s), time_s, before.read_s),
         )
         after, tracks = self._filter(record, after)
-        return after, self._estimate(record, after, tracks, is_restarted=is_late and bool(after.n_taken))
+        return after, self._estimate(record, after, tracks, is_restarted=is_restarted)
 
     def state(self) -> dict[str, Any]:
         """Return the state of the filter, for a JSON file and :meth:`from_state`.

@@ -7,7 +7,7 @@ using namespace magloc;
 
 MAGLOC_KERNEL(shape_fields, magnets) {
   if (!workspace) return 0;
-  const Body<Lanes> body(problem->shape, problem->size);
+  const MagnetBody<Lanes> body(problem->shape, problem->size);
   for (int64_t i = begin; i < end; i += n_lanes<Lanes>) {
     Lanes d[3], m[3];
     for (int a = 0; a < 3; ++a) {
@@ -35,7 +35,7 @@ MAGLOC_KERNEL(shape_fields, magnets) {
 
 MAGLOC_KERNEL(aligned_fields, aligned_magnets) {
   if (!workspace) return 0;
-  const Body<Lanes> body(problem->shape, problem->size);
+  const MagnetBody<Lanes> body(problem->shape, problem->size);
   for (int64_t i = begin; i < end; i += n_lanes<Lanes>) {
     Lanes d[3], m[3];
     for (int a = 0; a < 3; ++a) {

@@ -55,6 +55,12 @@ class Shape:
     ------
     ValueError
         The kind is unknown, or the sizes are not those of such a body.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> round(1e9 * magloc.Shape("cylinder", (0.010, 0.004)).volume_m3)  # mm³
+    314
     """
 
     kind: str

@@ -340,7 +340,7 @@ class TestDesign:
         assert sum(steps) == search.n_steps
 
     def test_no_room(self):
-        with pytest.raises(ValueError, match="Input task must leave room"):
+        with pytest.raises(ValueError, match="Input task must allow sensors"):
             design_array(replace(TASK, least_spacing_m=5.0, search=SMALL))
 
     def test_too_few_sensors(self):

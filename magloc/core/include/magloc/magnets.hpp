@@ -6,7 +6,7 @@
 MAGLOC_BEGIN
 // A body's shape, and the distance from which its field is a series.
 template <class T>
-class Body {
+class MagnetBody {
   int64_t shape_;
   double size_[3], multipoles_[n_multipoles], far_square_;
 
@@ -27,7 +27,7 @@ class Body {
   }
 
  public:
-  Body(int64_t shape, const double (&size)[3]) : shape_(shape), multipoles_{} {
+  MagnetBody(int64_t shape, const double (&size)[3]) : shape_(shape), multipoles_{} {
     double longest = 0.0;
     for (int i = 0; i < 3; ++i) size_[i] = size[i], longest = maximum(longest, 2.0 * size_[i]);
     if (shape_ == 1) fill_multipoles(size_, multipoles_);
@@ -94,7 +94,7 @@ template <class T>
 struct AlignedField {
   T field[3], by_position[3][3], by_moment[3][3], by_roll[3];
 
-  MAGLOC_INLINE AlignedField(const Body<T> &body, const T (&d)[3], const T (&m)[3], const T *roll = nullptr) {
+  MAGLOC_INLINE AlignedField(const MagnetBody<T> &body, const T (&d)[3], const T (&m)[3], const T *roll = nullptr) {
     const T inverse = inverse_root(dot(m, m)), strength = 1.0 / inverse;
     // The frame's axes by the least turn of its z axis, or of the opposite one where that is ambiguous, to the moment.
     const T n[3] = {m[0] * inverse, m[1] * inverse, m[2] * inverse}, one = broadcast<T>(1.0);

@@ -26,8 +26,8 @@ class RowReadings {
   double true_rotation_[9], turn_of_change_[3][3], by_field_[3][3];  // where the pose has errors
   int64_t *const first_ = space_.take<int64_t>(n_), *const end_ = space_.take<int64_t>(n_);
   bool has_modulus_ = false, is_sparse_ = false;
-  const Body<T> body_{maximum(p_.shape, (int64_t)0), p_.size};  // of all sources, unless they are dipoles
-  int64_t row_ = -1;                                            // whose readings are loaded
+  const MagnetBody<T> body_{maximum(p_.shape, (int64_t)0), p_.size};  // of all sources, unless they are dipoles
+  int64_t row_ = -1;                                                  // whose readings are loaded
 
  public:
   Padded<T> effect{space_, p_.n_nuisances, k_};  // of nuisances on the readings
