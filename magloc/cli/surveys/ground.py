@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from arrays.io.errors import InputError, naming, naming_options
-from arrays.typing import FloatArray, Vector
+from arrays.typing import Vector
 from magloc.cli.framework import note, refuse_outside
 
 if TYPE_CHECKING:
     import arrays
+    from arrays.typing import FloatArray
     from magloc.readings import Readings
     from magloc.terrain.surface import Terrain
 
