@@ -197,7 +197,7 @@ class TestBadInput:
             ("moment_Am2 = 100", "moment_Am2 = -1", ["key moment_Am2: found -1"]),
             ("sources = 256", "sources = 300", ["key sources: found 300", "power of two"]),
             ("refined = 1", "refined = 9", ["9 refined of 3 starts"]),
-            ("noise_nT = 1.0", "noise_nT = 1.0\nleast_spacing_m = 9", ["leave room"]),
+            ("noise_nT = 1.0", "noise_nT = 1.0\nleast_spacing_m = 9", ["must allow sensors"]),
             ("[search]", "[criterion]\nlevel = 1.0\n[search]", ["key level: found 1"]),
             ("[search]", "[surch]", ["unknown key", "search"]),
         ],
