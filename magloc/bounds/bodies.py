@@ -88,16 +88,22 @@ def body_bounds(array: SensorArray, body: MagnetBody, n: int = N_POSES) -> BodyB
     check_magnitudes(array)
     used = with_offsets_as_noise(array)
     position_m, R = spread_poses(body, used, n)
-    readings = used.readings_of(used.ambient_fields + body_fields(body, used.positions, position_m, R))
-    covariance = np.full((n, 6, 6), np.nan)
-    for rows in whitened_rows(used, readings, None, n):
-        x, turn = position_m[rows.index], R[rows.index]
-        *_, errors = linearise(rows.model, body, x, turn)
+    return BodyBounds(position_m, R, pose_covariances(used, body, position_m, R), body_symmetry(body).words)
+
+
+def pose_covariances(array: SensorArray, body: MagnetBody, position_m: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the bounds (n, 6, 6) of :class:`BodyBounds` at poses; errors of the magnets count as noise."""
+    readings = array.readings_of(array.ambient_fields + body_fields(body, array.positions, position_m, R))
+    covariance = np.full((len(R), 6, 6), np.nan)
+    outside = np.flatnonzero(np.isfinite(readings).all(axis=1))  # a sensor inside a magnet has no reading
+    for rows in whitened_rows(array, readings[outside], None, len(R)):
+        index = outside[rows.index]
+        _, jacobian, errors = linearise(rows.model, body, position_m[index], R[index])
         if errors.shape[-1]:
             rows = rows.marginalise(errors)
-        _, jacobian, _ = linearise(rows.model, body, x, turn)
-        covariance[rows.index] = inverses(jacobian)
-    return BodyBounds(position_m, R, covariance, body_symmetry(body).words)
+            _, jacobian, _ = linearise(rows.model, body, position_m[index], R[index])
+        covariance[index] = inverses(jacobian)
+    return covariance
 
 
 def _largest(covariance: FloatArray) -> FloatArray:

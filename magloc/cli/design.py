@@ -1,10 +1,10 @@
-"""``magloc design``: positions of an array's sensors."""
+"""``magloc design``: positions of an array's sensors, or of a body's magnets."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +14,11 @@ from cyclopts.validators import Number
 
 import arrays
 import magloc
-from arrays.io.errors import naming
+from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
 from magloc.cli.framework import CommonOptions, Flag, note, print_result, progress, whole_number
 
+_DEFAULT_TASK = "half-space-2m"
 Sensors = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=1000))]
 
 if TYPE_CHECKING:
@@ -28,13 +29,16 @@ if TYPE_CHECKING:
 
 
 def design(
-    task: str = "half-space-2m",
+    task: str = _DEFAULT_TASK,
     /,
     *,
     out: Path | None = None,
     png: Path | None = None,
     json: Flag = False,
     counts: Annotated[list[Sensors] | None, Parameter(consume_multiple=True)] = None,
+    array: Path | None = None,
+    body: Path | None = None,
+    out_body: Path | None = None,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Optimise the positions of an array's sensors for the sources that it has to locate.
@@ -43,12 +47,16 @@ def design(
     array with a tetrahedron, a cube and a cross of the same span, and with an even grid of as many sensors in the same
     volume. An interrupted command writes the best array so far.
 
+    With --array and --body, places the magnets of the body instead, and turns their moments, for the smallest bound of
+    the pose over the limits of the body file. Prints the bounds of magloc bounds --body before and after.
+
     Parameters
     ----------
     task : str
-        Built-in task, or task file (TOML) with sensors, volume or surface, sources and criterion.
+        Built-in task, or task file (TOML) with sensors, volume or surface, sources and criterion. With --body a task
+        file with magnets and volume; sensors move too if it has sensors and sensor_volume.
     out : Path
-        Array file to write; by default design-TASK.toml.
+        Array file to write; by default design-TASK.toml. With --body only if sensors move.
     png : Path
         Picture to write (.png): the sensors, and the standard deviation of the range over the distance.
     json : bool
@@ -56,9 +64,21 @@ def design(
     counts : list of int
         Numbers of sensors, in place of the task's. Writes one array each, NAME-NUMBER.toml, and shows the gain of more
         sensors.
+    array : Path
+        Array file (TOML) of the sensors about the body.
+    body : Path
+        Body file (TOML) of a rigid body of two or more magnets, with limits of its position.
+    out_body : Path
+        Body file to write; by default design-TASK-body.toml.
     common : CommonOptions
         Common options.
     """
+    if body is not None:
+        _design_body(task, array, body, out_body, out, {"--png": png, "--counts": counts}, common.seed, as_json=json)
+        return
+    for name, path in (("--array", array), ("--out-body", out_body)):
+        if path is not None:
+            raise InputError(f"{name}: found no --body, expected the body file.")
     wanted = magloc.DesignTask.read(task)
     target = Path(f"design-{wanted.name}.toml") if out is None else out
     if counts:
@@ -90,6 +110,29 @@ def design(
     note(
         f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote {target}{drawn}"
     )
+
+
+def _design_body(
+    task: str,
+    array: Path | None,
+    body: Path,
+    out_body: Path | None,
+    out: Path | None,
+    of_arrays: Mapping[str, object],
+    seed: int,
+    *,
+    as_json: bool,
+) -> None:
+    """Design a body; refuse options of an array's design."""
+    from magloc.cli.moments.body_design import design_with_body
+    from magloc.cli.moments.body_poses import refuse_with_body
+
+    refuse_with_body(of_arrays)
+    if array is None:
+        raise InputError("--body: found no --array, expected the array file.")
+    if task == _DEFAULT_TASK:
+        raise InputError("--body: found no task file, expected one with the tables magnets and volume.")
+    design_with_body(task, array, body, out_body, out, seed, as_json=as_json)
 
 
 def _compare_counts(

@@ -24,7 +24,7 @@ from arrays.geometries import GEOMETRIES
 from arrays.io.lazy import by_name
 from arrays.io.values import accept_seed, seed_of
 from arrays.typing import FloatArray, Rng
-from magloc.design.descent import Descent, Sample, descend, is_spaced, move_into_volume
+from magloc.design.descent import ArrayProblem, Sample, descend_from_starts
 from magloc.design.evaluation import Judgement, fits, judge, random_rotation, references, unit_shape, worst_case
 from magloc.design.task import N_DRAWN, DesignTask
 from magloc.directions import fibonacci_directions
@@ -158,48 +158,35 @@ def design_array(
     known = references(task, large, np.random.default_rng(of_references))
     buildable = [array.positions for array in known if array.n_sensors == task.n_sensors and fits(task, array)]
     shapes = starts_of(task, search.n_starts, np.random.default_rng(of_starts))
-    places = [move_into_volume(task, start) for start in [*buildable, *shapes][: search.n_starts]]
-    places = [start for start in places if is_spaced(task, start) and np.isfinite(small.value(task, start))]
-    if not places:
+    found = descend_from_starts(
+        ArrayProblem(task, small),
+        ArrayProblem(task, large),
+        [*buildable, *shapes][: search.n_starts],
+        search,
+        step_done,
+        lambda sensors: better(task.array(sensors)),
+    )
+    if found is None:
         raise ValueError(
             "Input task must allow sensors, least_spacing_m apart, that determine the range of its sources; instead no"
             " start has such sensors."
         )
-    values = [large.value(task, start) for start in places]
-    first = int(np.argmin(values))
-    best = Descent(places[first], values[first], 0, False)
-    better(task.array(best.sensors))
-
-    def run_descent(sample: Sample, start: FloatArray, max_iterations: int) -> Descent:
-        """Run a descent, and keep its end if it is the best so far on the large sample."""
-        nonlocal best
-        end = descend(task, sample, start, max_iterations=max_iterations, step_done=step_done)
-        value = large.value(task, end.sensors)
-        if value <= best.value:
-            best = Descent(end.sensors, value, end.iterations, end.converged and sample is large)
-            better(task.array(best.sensors))
-        return end
-
-    rough = [run_descent(small, start, search.small_iterations) for start in places]
-    step_done((search.n_starts - len(places)) * search.small_iterations)
-    chosen = sorted(rough, key=lambda end: end.value)[: search.n_refined]
-    fine = [run_descent(large, end.sensors, search.large_iterations) for end in chosen]
-    array = task.array(best.sensors)
+    array = task.array(found.best.points)
     return Design(
         task=task,
         array=array,
-        fitted_m=best.value,
-        start_m=values[first],
-        converged=best.converged,
-        n_converged=sum(end.converged for end in fine),
-        n_descents=len(fine),
+        fitted_m=found.best.value,
+        start_m=found.first_value,
+        converged=found.best.converged,
+        n_converged=found.n_converged,
+        n_descents=found.n_refined,
         judged=judge(
             task,
-            (array, task.array(places[first], BEST_START), *known),
+            (array, task.array(found.first, BEST_START), *known),
             random_sample(task, search.n_judged, np.random.default_rng(of_judge)),
             np.random.default_rng(of_judge.spawn(1)[0]),
         ),
-        worst_m=worst_case(task, best.sensors, large),
+        worst_m=worst_case(task, found.best.points, large),
     )
 
 

@@ -314,29 +314,45 @@ _BELOW_ONE = Rule(
 )
 
 
-class _Criterion(Table, kw_only=True):
+class CriterionTable(Table, kw_only=True):
+    """Table of the criterion."""
+
     quantity: Annotated[str, one_of(("quantile", "mean"), "quantile or mean")] = "quantile"
     level: Annotated[float, _BELOW_ONE] = 0.95
 
+    def criterion(self) -> Criterion:
+        """Return the criterion of the table."""
+        return Mean() if self.quantity == "mean" else Quantile(self.level)
 
-def _up_to(least: int) -> Rule:
+
+def at_least(least: int) -> Rule:
+    """Return the rule of a large integer with a lower limit."""
     return Rule(lambda value: least <= value <= _MOST_OF_ANYTHING, f"{least} to {_MOST_OF_ANYTHING}")
 
 
-class _Search(Table, kw_only=True):
+class StartsTable(Table, kw_only=True):
+    """Numbers of starts of a search."""
+
     starts: int = DesignSearch.n_starts
     refined: int = DesignSearch.n_refined
-    sources: int = 2**DesignSearch.log2_large
-    iterations: Annotated[int, _up_to(1)] = DesignSearch.large_iterations
-    judged: Annotated[int, _up_to(1000)] = DesignSearch.n_judged
 
     def check(self) -> None:
+        """Refuse impossible numbers."""
         if not 1 <= self.refined <= self.starts <= 10_000:
             raise RefusalError(
                 "",
                 f"found {self.refined} refined of {self.starts} starts, expected 1 or more refined, and no more than"
                 " starts",
             )
+
+
+class _Search(StartsTable, kw_only=True):
+    sources: int = 2**DesignSearch.log2_large
+    iterations: Annotated[int, at_least(1)] = DesignSearch.large_iterations
+    judged: Annotated[int, at_least(1000)] = DesignSearch.n_judged
+
+    def check(self) -> None:
+        super().check()
         if not (_LEAST_LOG2 <= self.log2 <= _MOST_LOG2 and self.sources == 1 << self.log2):
             expected = f"a power of two from {1 << _LEAST_LOG2} to {1 << _MOST_LOG2}"
             raise RefusalError("sources", f"found {self.sources}, expected {expected}")
@@ -351,7 +367,7 @@ class _TaskFile(File, kw_only=True):
     sensors: _Sensors
     volume: dict[str, Any]
     sources: dict[str, Any]
-    criterion: _Criterion = msgspec.field(default_factory=_Criterion)
+    criterion: CriterionTable = msgspec.field(default_factory=CriterionTable)
     search: _Search = msgspec.field(default_factory=_Search)
     name: str | None = None
 
@@ -372,10 +388,10 @@ def read_task(name_or_path: str) -> DesignTask:
         n_sensors=sensors.count,
         kind=cast(SensorKind, sensors.kind),
         noise_T=sensors.noise_nT / 1e9,
-        volume=_volume(f"{path}, table volume", file.volume, Path(path).parent),
+        volume=volume_of_table(f"{path}, table volume", file.volume, Path(path).parent),
         region=sources.sources(),
         moment_Am2=sources.moment_Am2,
-        criterion=Mean() if file.criterion.quantity == "mean" else Quantile(file.criterion.level),
+        criterion=file.criterion.criterion(),
         ambient_T=None if ambient is None else (ambient[0] / 1e9, ambient[1] / 1e9, ambient[2] / 1e9),
         least_spacing_m=sensors.least_spacing_m,
         search=DesignSearch(
@@ -390,7 +406,8 @@ def read_task(name_or_path: str) -> DesignTask:
     )
 
 
-def _volume(place: str, table: dict[str, Any], folder: Path) -> Volume:
+def volume_of_table(place: str, table: dict[str, Any], folder: Path) -> Volume:
+    """Return the volume of a table; `place` is for errors, `folder` that of a mesh."""
     volume: Volume = named_section(place, table, "shape", _VOLUMES).volume(folder)
     reach = float(np.abs(volume.centre).max()) + volume.radius
     if not (volume.radius > 0.0 and reach < _LARGEST):

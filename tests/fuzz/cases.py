@@ -100,7 +100,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "--array array.toml --grid 3 --moments 4",
         "--array body-array.toml --body body.toml --json",
     ),
-    "magloc design": ("task.toml --out out.toml --json",),
+    "magloc design": (
+        "task.toml --out out.toml --json",
+        "body-task.toml --array body-array.toml --body body.toml --out-body out.toml --json",
+    ),
     "magloc view": (
         "array.toml --html out.html",
         "readings.csv --array array.toml --html out.html",
@@ -310,6 +313,20 @@ towards = [1.0, 0.0, 0.0]
 nearest_m = 2.0
 farthest_m = 2.0
 moment_Am2 = 100.0
+""",
+    "body-task.toml": """format_version = 1
+[magnets]
+least_spacing_m = 0.004
+directions = "free"
+[volume]
+shape = "cylinder"
+radius_m = 0.008
+height_m = 0.0
+[search]
+starts = 1
+refined = 1
+poses = 64
+iterations = 3
 """,
 }
 

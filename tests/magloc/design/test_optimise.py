@@ -27,7 +27,7 @@ from scipy.stats.mstats import hdquantiles
 
 from arrays.geometries import cube, tetrahedron
 from magloc.bounds.crlb import cramer_rao_bounds
-from magloc.design.descent import Sample, descend, is_spaced, move_into_volume
+from magloc.design.descent import ArrayProblem, Sample, descend, is_spaced, move_into_volume
 from magloc.design.evaluation import references, worst_case
 from magloc.design.optimise import design_array, random_sample, sobol_sample, starts_of
 from magloc.design.regions import Block, Cap, Mean, Quantile
@@ -200,14 +200,14 @@ class TestDescent:
         sample = sobol_sample(TASK, 9, rng(23))
         steps: list[int] = []
         start = starts_of(TASK, 4, rng(24))[0]
-        found = descend(TASK, sample, start, max_iterations=400, step_done=steps.append)
+        found = descend(ArrayProblem(TASK, sample), start, max_iterations=400, step_done=steps.append)
         assert found.converged
         assert sum(steps) == 400  # those that were not needed count as done
         again = minimize(
             lambda x: np.log(sample.value(TASK, BALL.nearest(x.reshape(4, 3)))),
-            found.sensors.ravel(),
+            found.points.ravel(),
             method="Nelder-Mead",
-            options={"maxfev": 2000, "initial_simplex": found.sensors.ravel() + 0.01 * np.eye(13, 12)},
+            options={"maxfev": 2000, "initial_simplex": found.points.ravel() + 0.01 * np.eye(13, 12)},
         )
         assert again.fun > np.log(found.value) - 0.03
 
@@ -215,14 +215,14 @@ class TestDescent:
     def test_never_worse_than_its_start(self, seed):
         sample = sobol_sample(TASK, 7, rng(25))
         start = BALL.random(4, rng(seed))
-        found = descend(TASK, sample, start, max_iterations=5)
+        found = descend(ArrayProblem(TASK, sample), start, max_iterations=5)
         assert found.value <= sample.value(TASK, start)
-        assert found.value == pytest.approx(sample.value(TASK, found.sensors), rel=1e-9)
+        assert found.value == pytest.approx(sample.value(TASK, found.points), rel=1e-9)
 
     def test_iterations_used_up_are_no_convergence(self):
         sample = sobol_sample(TASK, 7, rng(26))
         steps: list[int] = []
-        found = descend(TASK, sample, TETRAHEDRON, max_iterations=3, step_done=steps.append)
+        found = descend(ArrayProblem(TASK, sample), TETRAHEDRON, max_iterations=3, step_done=steps.append)
         assert not found.converged
         assert sum(steps) == 3
 
