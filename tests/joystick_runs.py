@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 import magloc
 from arrays.array import SensorArray
 from magloc.bodies.body import MagnetBody
-from magloc.bodies.locator import BodyLocator
+from magloc.bodies.filter import track_body
+from magloc.bodies.locator import locate_body
 from magloc.calibration.bodies.results import BodyCalibration
 from magloc.readings import Readings
 from magloc.truth import Truth
@@ -69,9 +70,9 @@ def calibrate(device: Joystick, way: str, rng: np.random.Generator) -> tuple[Bod
     return result, readings, stated
 
 
-def follow(array: SensorArray, body: MagnetBody, readings: Readings) -> FloatArray:
-    """Return the poses (n, 6) of all rows: positions and rotation vectors."""
-    found = BodyLocator(array, body).fit_rows(readings.values_T)
+def follow(array: SensorArray, body: MagnetBody, readings: Readings, *, tracked: bool = False) -> FloatArray:
+    """Return the poses (n, 6) of all rows, each by itself or tracked: positions and rotation vectors."""
+    found = (track_body if tracked else locate_body)(array, body, readings)
     return np.concatenate([found.position_m[:, 0], found.rotation.as_rotvec()], axis=1)
 
 
@@ -163,9 +164,11 @@ def run(seed: int, seconds: float = 2.0) -> dict[str, Figures]:
     results = {}
     for way in WAYS:
         result, readings, stated = calibrate(device, way, rng)
-        results[way] = of(partial(follow, result.array, result.body))
+        for name, tracked in ((way, False), (f"{way}, tracked", True)):
+            results[name] = of(partial(follow, result.array, result.body, tracked=tracked))
         if way == "jig":
             matrix = fitted_matrix(readings.values_T, stated)
             results["matrix 6×9"] = of(partial(apply_matrix, matrix))
-    results["as drawn"] = of(partial(follow, joystick.nominal_array(), joystick.nominal_knob()))
+    for name, tracked in (("as drawn", False), ("as drawn, tracked", True)):
+        results[name] = of(partial(follow, joystick.nominal_array(), joystick.nominal_knob(), tracked=tracked))
     return results

@@ -22,12 +22,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0)
     given = parser.parse_args()
     runs = [run(seed, given.seconds) for seed in range(given.first, given.first + given.seeds)]
-    print(f"{'':24}{'mm':>8}{'°':>8}{'mm, own frame':>16}{'°, own frame':>16}{'cross-talk %':>14}{'lost %':>8}")
+    print(f"{'':37}{'mm':>8}{'°':>8}{'mm, own frame':>16}{'°, own frame':>16}{'cross-talk %':>14}{'lost %':>8}")
     for name in runs[0]:
         values = np.array([astuple(each[name]) for each in runs]) * [1.0, 1.0, 1.0, 1.0, 100.0, 100.0]
         for word, row in (("median", np.median(values, axis=0)), ("worst", values.max(axis=0))):
             mm, deg, own_mm, own_deg, talk, lost = row.tolist()
-            print(f"{name:17}{word:>7}{mm:8.4f}{deg:8.3f}{own_mm:16.4f}{own_deg:16.3f}{talk:14.2f}{lost:8.1f}")
+            print(f"{name:30}{word:>7}{mm:8.4f}{deg:8.3f}{own_mm:16.4f}{own_deg:16.3f}{talk:14.2f}{lost:8.1f}")
 
 
 if __name__ == "__main__":

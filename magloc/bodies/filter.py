@@ -17,7 +17,6 @@ from arrays.typing import FloatArray
 from magloc import core
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.locator import BodyLocator
-from magloc.bodies.poses import BodyPoses
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
 from magloc.bodies.search import fit_problem, packed, unpacked
 from magloc.bodies.track import BodyMotion, BodyTrack
@@ -60,6 +59,11 @@ class BodyTracker:
         self._state: _State | None = None
         self._lasting: tuple[FloatArray, FloatArray] | None = None  # of the errors: mean, covariance
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a kernel makes the steps: that of dipoles."""
+        return not self.body.has_shapes
+
     def restart(self) -> None:
         """Begin a new track at the next row, whose time may be earlier; what is known of lasting errors stays."""
         self._keep_errors()
@@ -69,13 +73,7 @@ class BodyTracker:
         """Return the track over rows of raw readings (n, C) [T] at times (n,), which come after all rows before."""
         values = check_rows(self.array, readings_T)
         n = len(values)
-        track = BodyTrack(
-            **vars(BodyPoses.none(n, 1, self.locator.symmetry.words)),
-            status=[""] * n,
-            velocity_m_s=np.full((n, 3), np.nan),
-            rate_rad_s=np.full((n, 3), np.nan),
-        )
-        track = replace(track, time_s=np.asarray(time_s, dtype=np.float64))
+        track = replace(BodyTrack.none(n, 1, self.locator.symmetry.words), time_s=np.asarray(time_s, dtype=np.float64))
         rows = self._rows(values, ambient_T)
         problem = _TrackProblem(self, rows, track.time_s, self._last_s)
         row = 0
@@ -256,7 +254,7 @@ class _TrackProblem:
             steps[0] = [0.0, 1.0, 0.0, 0.0, 0.0] * 2
             lasting[0], added[0], curvature[0] = 1.0, 0.0, 1.0 / _WIDENED
         body = self.tracker.body
-        if body.has_shapes:
+        if not self.tracker.is_compiled:
             return self._follow_shapes(
                 state, row, (steps, lasting, added), curvature, (poses, rates, covariances, nis, status)
             )

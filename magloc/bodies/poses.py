@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -61,6 +62,11 @@ class BodyPoses(Result):
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def __getitem__(self, rows: slice) -> Self:
+        """Return some rows."""
+        of_rows = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "symmetry"}
+        return replace(self, **{name: values[rows] for name, values in of_rows.items()})
 
     @property
     def solved(self) -> np.ndarray:

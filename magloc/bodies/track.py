@@ -66,6 +66,12 @@ class BodyTrack(BodyPoses):
 
     command = "magloc track --body"
 
+    @classmethod
+    def none(cls, n: int, width: int = 1, symmetry: str = "") -> BodyTrack:
+        """Return n rows without a pose."""
+        poses, (velocity, rate) = BodyPoses.none(n, width, symmetry), np.full((2, n, 3), np.nan)
+        return cls(**vars(poses), status=[""] * n, velocity_m_s=velocity, rate_rad_s=rate)
+
     @property
     def nis(self) -> FloatArray:
         """Normalised innovation squared of each row (n,)."""

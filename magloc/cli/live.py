@@ -14,7 +14,7 @@ from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError, naming, naming_options
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, note, refuse_outside
+from magloc.cli.framework import ABOVE_ZERO, Flag, QuietOptions, note, print_json, refuse_outside
 from magloc.cli.moments.magnet import MagnetOptions
 from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_place
 
@@ -153,22 +153,20 @@ def live(
         with naming_place(), naming(str(array), readings=source, time_s=source):
             calibrate_live(used, array, source, replay_speed, turning, known.where, page)
         return
-    if body is not None:
-        from magloc.cli.moments.body_poses import follow_with_body, refuse_with_body
-
-        refuse_with_body({"--out": out, "--rest-s": rest_s or None, "--view": page.view})
-        with naming_place(), naming(str(array), readings=source, time_s=source):
-            follow_with_body(used, body, source, motion, known, replay_speed)
-        return
     with naming(str(array), sources=f"--sources {motion.sources}"):
-        follower = motion.follower(used, known, known.where, rest_s)
+        if body is None:
+            follower = motion.follower(used, known, known.where, rest_s)
+        else:
+            from magloc.cli.moments.body_poses import body_follower
+
+            follower = body_follower(used, body, motion, known, rest_s)
     with ExitStack() as open_page:
         view = open_page.enter_context(open_live_page(follower, page)) if page.view else None
         table = None if out is None else open_page.enter_context(GrowingTable(out))
         try:
             with naming_place(), naming(str(array), readings=source, time_s=source):
                 for point in follower.follow(source, replay_speed=replay_speed):
-                    motion.print_entry(point, latency_ms=1e3 * point.latency_s)
+                    _print(point, motion)
                     if table is not None:
                         table.add(_columns(point, moves=follower.moves))
                     if view is not None:
@@ -178,6 +176,8 @@ def live(
                 note(str(follower.tally))
         if view is not None:
             view.wait()
+    if body is not None and not follower.tally.tracked:
+        raise InputError(f"{source}: found no row in which the body can be tracked.")
 
 
 def open_live_page(follower: Follower, page: PageOptions) -> LiveView:
@@ -196,10 +196,26 @@ def open_page_of(make: Callable[..., _Live], page: PageOptions) -> _Live:
     return view
 
 
+def _print(point: LivePoint, motion: MotionOptions) -> None:
+    """Print the JSON line of a row at once."""
+    from magloc.live.body import BodyPoint
+
+    latency_ms = 1e3 * point.latency_s
+    if not isinstance(point.sources, BodyPoint):
+        motion.print_entry(point, latency_ms=latency_ms)
+        return
+    (entry,) = point.sources.poses.entries()
+    print_json(entry | {"latency_ms": latency_ms})
+    sys.stdout.flush()
+
+
 def _columns(point: LivePoint, *, moves: bool) -> dict[str, Column]:
     """Return the columns of one row, or of one row for each of several sources."""
+    from magloc.live.body import BodyPoint
     from magloc.tracking.files import columns_of_track
 
+    if isinstance(point.sources, BodyPoint):
+        return point.sources.poses.columns()
     if point.sources is not None:
         return columns_of_track(point.sources.tracks, ids=[track.id for track in point.sources.tracks])
     return columns_of_track([point], point.row.origin_m[None] if moves else None)

@@ -1,46 +1,80 @@
-"""Tracking of a body of several magnets while its rows come in."""
+"""Pose of a body of several magnets, with its magnets as sources."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from magloc.ambient import Place, in_world_field, with_ambient_field
+from magloc.bodies.body import MagnetBody
+from magloc.bodies.field import placed_magnets
 from magloc.bodies.filter import BodyTracker
+from magloc.bodies.poses import BodyPoses
 from magloc.bodies.track import BodyTrack
-from magloc.live.rows import RowParser, rows_of_stream
-from magloc.live.tally import Clock, Tally
-from magloc.live.transports import STANDARD_INPUT, open_stream, sender_waits
-from magloc.readings import log_format, without_saturated
+from magloc.navigation.rotations import cross_matrix
+from magloc.tracking.results import SourcePoint, SourcesPoint
+from magloc.tracking.rows import Row
 
 
-def follow_body(
-    tracker: BodyTracker,
-    source: str,
-    tally: Tally,
-    *,
-    sensors: Sequence[str] | None = None,
-    place: Place | None = None,
-    replay_speed: float = 1.0,
-) -> Generator[tuple[BodyTrack, float]]:
-    """Yield the tracks of new rows of a stream, and the time at which they arrived; see :func:`magloc.live.track`.
+@dataclass(frozen=True, eq=False)
+class BodyPoint(SourcesPoint):
+    """Pose of a body at one instant; its magnets are the tracks.
 
-    Late, doubled and garbled rows are counted in the tally and skipped.
+    Attributes
+    ----------
+    time_s, tracks, status, chi2, dof, dropped_sensors
+        See :class:`SourcesPoint`.
+    body : MagnetBody
+    poses : BodyTrack of length one
+        Pose, covariance, flags and rates.
     """
-    array, waits = tracker.array, sender_waits(source)
-    clock = Clock(tally, tracker.restart)
-    with open_stream(source, replay_speed=replay_speed, form=log_format(array, sensors)) as stream:
-        parser = RowParser(array, stream.name, tally, sensors, is_file=source != STANDARD_INPUT and waits)
-        for readings, arrival_s in rows_of_stream(stream, parser, tally):
-            new = np.array([clock.accepts(time_s) for time_s in readings.time_s.tolist()], dtype=bool)
-            if not new.any():
-                continue
-            rows = without_saturated(readings[new], array)
-            _, ambient_T = with_ambient_field(array, rows, place, gradient=False)
-            rows = in_world_field(rows, array)
-            track = tracker.follow(rows.values_T, rows.time_s, rows.ambient_T if ambient_T is None else ambient_T)
-            tally.tracked += int(track.solved.sum())
-            tally.latencies_s += [time.perf_counter() - arrival_s] * len(track)
-            yield track, arrival_s
+
+    body: MagnetBody = field(kw_only=True)
+    poses: BodyTrack = field(kw_only=True)
+
+
+def body_points(body: MagnetBody, track: BodyTrack) -> list[BodyPoint]:
+    """Return the rows of a track as points."""
+    magnets = magnet_points(body, track)
+    values = zip(track.time_s.tolist(), track.status, track.nis.tolist(), track.dof.tolist(), strict=True)
+    return [
+        BodyPoint(time_s, magnets.get(i, ()), status, chi2, dof, body=body, poses=track[i : i + 1])
+        for i, (time_s, status, chi2, dof) in enumerate(values)
+    ]
+
+
+def advance(tracker: BodyTracker, rows: Sequence[Row]) -> list[BodyPoint]:
+    """Update the tracker with rows in their order, and return their points."""
+    ambient = [row.ambient_T for row in rows if row.ambient_T is not None]
+    values, times = (np.array([getattr(row, name) for row in rows]) for name in ("readings_T", "time_s"))
+    return body_points(tracker.body, tracker.follow(values, times, np.array(ambient) if ambient else None))
+
+
+def without_pose(body: MagnetBody, rows: Sequence[Row], status: str) -> list[BodyPoint]:
+    """Return points that have only a status."""
+    track = BodyTrack.none(len(rows))
+    track = replace(track, time_s=np.array([row.time_s for row in rows]), status=[status] * len(rows))
+    return body_points(body, replace(track, reason=track.status))
+
+
+def magnet_points(body: MagnetBody, poses: BodyPoses) -> dict[int, tuple[SourcePoint, ...]]:
+    """Return the magnets as sources by the rows that have a pose; ids are 1, 2, … in the order of the body.
+
+    The covariance of a magnet is that of the pose, without the errors of the body's own geometry and moments.
+    """
+    rows = np.flatnonzero(poses.solved)
+    R = poses.R[rows, 0]
+    places, moments = placed_magnets(body, poses.position_m[rows, 0], R)
+    by_pose = np.zeros((len(rows), len(body.magnets), 6, 6))
+    by_pose[..., :3, :3] = np.eye(3)
+    for part, own in ((slice(3), body.positions_m), (slice(3, 6), body.moments_Am2)):
+        by_pose[..., part, 3:] = -R[:, None] @ cross_matrix(own)
+    covariances = by_pose @ poses.covariance[rows, 0][:, None] @ np.swapaxes(by_pose, -1, -2)
+    return {
+        row: tuple(
+            SourcePoint(float(poses.time_s[row]), place, moment, covariance, status="tracked", id=id)
+            for id, (place, moment, covariance) in enumerate(zip(*of_row, strict=True), start=1)
+        )
+        for row, *of_row in zip(rows.tolist(), places, moments, covariances, strict=True)
+    }

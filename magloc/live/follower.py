@@ -15,6 +15,10 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.io.errors import check_not_negative
 from magloc.ambient import Place, in_world_field, with_ambient_field
+from magloc.bodies.body import MagnetBody
+from magloc.bodies.filter import BodyTracker
+from magloc.bodies.track import BodyMotion
+from magloc.live import body as bodies
 from magloc.live.rest import RestBackground, check_rest
 from magloc.live.rows import RowParser, rows_of_stream
 from magloc.live.tally import Clock, Pace, Tally
@@ -41,6 +45,7 @@ _MOST_WAITING = 200
 # Older rows are skipped where the sender does not wait.
 _LONGEST_WAIT_S = 0.5
 RESTING, STOPPED, SKIPPED = "rest: the background is taken", "stopped", "skipped: newer rows were waiting"
+AnyTracker = Tracker | SourcesTracker | BodyTracker
 Source = str | Iterable["Readings | Mapping[str, float | None] | str"]
 
 
@@ -61,8 +66,8 @@ class LivePoint(TrackPoint):
     tally : Tally
         Counts of the whole stream so far.
     sources : SourcesPoint, optional
-        States of several sources, if they are tracked. The point itself then has no state of its own, only the time,
-        the status, the NIS and the dropped sensors.
+        States of several sources, or of a body, if they are tracked. The point itself then has no state of its own,
+        only the time, the status, the NIS and the dropped sensors.
 
     Examples
     --------
@@ -89,9 +94,9 @@ class Follower:
     ----------
     array : SensorArray
         Array with the positions, noise and calibration of its sensors.
-    motion : MotionModel or FreeMotion, optional
+    motion : MotionModel, FreeMotion or BodyMotion, optional
         Motion of the source; by default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s. Several sources need a
-        :class:`magloc.FreeMotion`.
+        :class:`magloc.FreeMotion`, a body needs a :class:`magloc.bodies.track.BodyMotion`.
     sources : int or "auto", optional
         Number of sources in one filter, as for :class:`magloc.SourcesTracker`; by default a filter of one source.
     prior : SourcePrior
@@ -102,6 +107,9 @@ class Follower:
         Place and date of the geomagnetic field.
     rest_s : float
         Duration of the rest, without a source near, before tracking begins [s].
+    body : MagnetBody, optional
+        Body of several magnets to track, in the array's frame; points then have a
+        :class:`magloc.live.body.BodyPoint` in `sources`.
 
     Attributes
     ----------
@@ -123,22 +131,23 @@ class Follower:
     def __init__(
         self,
         array: SensorArray,
-        motion: MotionModel | FreeMotion | None = None,
+        motion: MotionModel | FreeMotion | BodyMotion | None = None,
         *,
         sources: int | Literal["auto"] | None = None,
         prior: SourcePrior = NOTHING_KNOWN,
         sensors: Sequence[str] | None = None,
         place: Place | None = None,
         rest_s: float = 0.0,
+        body: MagnetBody | None = None,
     ) -> None:
         check_not_negative(rest_s=rest_s)
         self.array, self.prior, self.tally = array, prior, Tally()
-        self._motion, self._sources = motion, sources
-        if sources is not None or isinstance(motion, FreeMotion):
+        self._motion, self._sources, self._body = motion, sources, body
+        if sources is not None or body is not None or isinstance(motion, FreeMotion):
             self._new_tracker(array)  # raises an error for an array that cannot resolve the sources
         self._sensors, self._place = sensors, place
         self._in_field: SensorArray | None = None
-        self._tracker: Tracker | SourcesTracker | None = None
+        self._tracker: AnyTracker | None = None
         self._clock = Clock(self.tally, self.restart)
         self._background: RestBackground | None = None
         self._rest_rows: list[Row] = []
@@ -171,7 +180,11 @@ class Follower:
 
     def restart(self) -> None:
         """Begin a new track at the next row, and repeat a rest that is not over."""
-        self._tracker, self._rest_rows = None, []
+        self._rest_rows = []
+        if isinstance(self._tracker, BodyTracker):
+            self._tracker.restart()  # what it has learnt of lasting errors stays
+        else:
+            self._tracker = None
 
     def follow(self, source: Source, *, replay_speed: float = 1.0) -> Generator[LivePoint]:
         """Yield a point for every row of a source; see :func:`magloc.live.track`."""
@@ -191,11 +204,18 @@ class Follower:
         for i in range(_ROWS_TO_LOAD):
             _next_points(tracker, [Row(float(i), values_T)])
 
-    def _new_tracker(self, array: SensorArray) -> Tracker | SourcesTracker:
+    def _new_tracker(self, array: SensorArray) -> AnyTracker:
         """Return a new filter for the sources."""
         motion = self._motion
+        if self._body is not None:
+            if not isinstance(motion, BodyMotion | None) or self._sources is not None:
+                raise ValueError(
+                    "Input motion must be a BodyMotion, without sources, for a body; instead received"
+                    f" {motion} and sources={self._sources}."
+                )
+            return BodyTracker(array, self._body, motion)
         if self._sources is None:
-            if isinstance(motion, FreeMotion):
+            if isinstance(motion, FreeMotion | BodyMotion):
                 raise ValueError(
                     "Input motion must be a motion of one source where sources are not given; instead received"
                     f" {motion}."
@@ -260,6 +280,8 @@ class Follower:
                 x, y, z = readings.array_rotation[0].apply(ambient_T[0]).tolist()
                 array = replace(array, ambient_world_T=(x, y, z))
             self._in_field, self.moves = with_stated_pose(array, readings), readings.pose is not None
+            if self._body is not None:  # its pose is in the array's frame
+                self._in_field = replace(array, pose=None)
             if self._rest_s:
                 check_rest(array, moves=self.moves)
             warn_of_array(self._in_field)
@@ -270,6 +292,8 @@ class Follower:
                 self._first_rows.append(readings)
             if sum(map(len, self._first_rows)) >= FEWEST_ROWS:
                 warn_of_record(self._in_field, concatenate_readings(self._first_rows))
+        if self._body is not None:
+            used = replace(used, array_position_m=None, array_rotation=None, pose_sigma=None)
         if self._in_field.pose is None:
             return list(rows_of(used))
         return [row for one in used for row in rows_of(one)]  # the motion of a row is that since the previous one
@@ -309,6 +333,8 @@ class Follower:
 
     def _without_track(self, rows: Sequence[Row], status: str) -> list[tuple[Row, TrackPoint | SourcesPoint]]:
         """Return rows with points that have only a status."""
+        if self._body is not None:
+            return list(zip(rows, bodies.without_pose(self._body, rows, status), strict=True))
         if self._sources is None:
             return [(row, TrackPoint(row.time_s, status=status)) for row in rows]
         return [(row, SourcesPoint(row.time_s, (), status, math.nan, 0)) for row in rows]
@@ -322,6 +348,7 @@ class Follower:
         self._background = RestBackground.from_rows(self.array, rest)
         self._rest_s = 0.0
         self.restart()
+        self._tracker = None  # the offsets have other uncertainties
         return False
 
 
@@ -330,9 +357,12 @@ def _established_tracks(point: TrackPoint | SourcesPoint) -> Sequence[TrackPoint
     return [track for track in point.tracks if track.is_on_track]
 
 
-def _next_points(tracker: Tracker | SourcesTracker, rows: Sequence[Row]) -> Sequence[TrackPoint | SourcesPoint]:
+def _next_points(tracker: AnyTracker, rows: Sequence[Row]) -> Sequence[TrackPoint | SourcesPoint]:
     """Update the tracker with the first row, or with the first few, and return their points."""
-    return [tracker.update(rows[0])] if isinstance(tracker, SourcesTracker) else tracker.advance(rows[:MOST_AT_ONCE])
+    if isinstance(tracker, SourcesTracker):
+        return [tracker.update(rows[0])]
+    rows = rows[:MOST_AT_ONCE]
+    return bodies.advance(tracker, rows) if isinstance(tracker, BodyTracker) else tracker.advance(rows)
 
 
 def track(

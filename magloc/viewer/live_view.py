@@ -76,7 +76,8 @@ class LiveView(View):
         Parameters
         ----------
         point : TrackPoint or SourcesPoint
-            Result of :meth:`magloc.Tracker.update`, :meth:`magloc.SourcesTracker.update` or :func:`magloc.live.track`.
+            Result of :meth:`magloc.Tracker.update`, :meth:`magloc.SourcesTracker.update` or :func:`magloc.live.track`,
+            or a :class:`magloc.live.body.BodyPoint`.
         row : Readings of length one, optional
             Row of the point; a LivePoint contains it already.
         """

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from magloc.bodies.track import BodyMotion
     from magloc.cli.options import MotionOptions
     from magloc.cli.track import ConditioningOptions
+    from magloc.live.follower import Follower
     from magloc.readings import Readings
 
 
@@ -104,28 +105,17 @@ def motion_of_body(motion: MotionOptions) -> BodyMotion:
     return BodyMotion(speed, turn, default.correlation_s if motion.correlation_s is None else motion.correlation_s)
 
 
-def follow_with_body(
-    array: SensorArray, body: Path, source: str, motion: MotionOptions, known: KnownOptions, replay_speed: float
-) -> None:
-    """Print a JSON line for every row of a stream, as it comes in."""
-    import time
-
+def body_follower(
+    array: SensorArray, body: Path, motion: MotionOptions, known: KnownOptions, rest_s: float
+) -> Follower:
+    """Return the tracker of a body in a stream."""
     from magloc.bodies.body_file import read_body
-    from magloc.bodies.filter import BodyTracker
-    from magloc.live.body import follow_body
-    from magloc.live.tally import Tally
+    from magloc.live.follower import Follower
 
     refuse_bounds(known)
     refuse_with_body({"--known-moment-Am2": known.known_moment_Am2})
-    tracker, tally = BodyTracker(array, read_body(body), motion_of_body(motion)), Tally()
-    followed = follow_body(tracker, source, tally, sensors=known.ids, place=known.where, replay_speed=replay_speed)
-    for track, arrival_s in followed:
-        for entry in track.entries():
-            print_json(entry | {"latency_ms": 1e3 * (time.perf_counter() - arrival_s)})
-    if tally.faults:
-        note(str(tally), always=True)
-    if not tally.tracked:
-        raise InputError(f"{source}: found no row in which the body can be tracked.")
+    moves, magnets = motion_of_body(motion), read_body(body)
+    return Follower(array, moves, sensors=known.ids, place=known.where, rest_s=rest_s, body=magnets)
 
 
 def bounds_with_body(array: Path, body: Path, *, as_json: bool) -> None:

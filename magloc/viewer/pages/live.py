@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import combinations
 from threading import Lock
 from time import perf_counter
 from typing import Protocol
@@ -17,6 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
+from arrays.typing import FloatArray
+from magloc.bodies.field import body_fields
+from magloc.live.body import BodyPoint
 from magloc.live.follower import LivePoint
 from magloc.live.tally import Tally
 from magloc.readings import Readings
@@ -35,6 +39,7 @@ from magloc.viewer.scene.glyphs import (
     DipoleGlyph,
     SurfaceGlyph,
     add_lines,
+    length_text,
     show_segments,
 )
 from magloc.viewer.scene.legend import Entry, Swatch
@@ -115,6 +120,7 @@ class LivePage:
         self._arrivals: deque[float] = deque(maxlen=_RATE_ROWS)
         self._glyphs = ArrayGlyphs(server.scene, array)
         self._sources = {SINGLE_ID: LiveSource(server.scene, "/live", array, TRACK_COLOUR, REGION_COLOUR)}
+        self._frame = add_lines(server.scene, "/live/body", np.zeros((1, 2, 3)), DIPOLE_COLOUR, 2.0, visible=False)
         self._add_panels()
         self._thread = DrawingThread(self._draw, _FRAMES_PER_SECOND)
 
@@ -206,6 +212,7 @@ class LivePage:
         for id, source in self._sources.items():
             missing = TrackPoint(point.time_s)
             source.show(now.get(id), [sources_by_id(each).get(id, missing) for each in recent])
+        show_segments(self._frame, magnet_segments(point))
         self._source_panel.content = sources_html(point)
         self._stream_panel.content = texts.panel_html(self._stream_lines())
 
@@ -236,6 +243,11 @@ class LivePage:
         origins, R = np.array([row.origin_m for row in rows]), np.array([row.R_world_from_array for row in rows])
         time_s = np.array([point.time_s for point, _ in shown]) - last_s
         readings = Readings(values, time_s=time_s, array_position_m=origins, array_rotation=Rotation.from_matrix(R))
+        bodies = [body_of(point) for point, _ in shown]
+        if any(bodies):
+            predicted = np.array([body_readings(self._array, each) for each in bodies])
+            self._plot.replace_readings(readings, values - predicted)
+            return
         of_rows = [sources_by_id(point) for point, _ in shown]
         residuals_T = np.where(np.array([[bool(sources)] for sources in of_rows]), values, np.nan)
         for id in set().union(*of_rows):
@@ -255,8 +267,52 @@ def sources_by_id(point: TrackPoint | SourcesPoint) -> dict[int, TrackPoint]:
     return {SINGLE_ID: point}
 
 
+def body_of(point: TrackPoint | SourcesPoint) -> BodyPoint | None:
+    """Return the pose of a body, None for other sources and for a row without a body."""
+    several = point.sources if isinstance(point, LivePoint) else point
+    return several if isinstance(several, BodyPoint) else None
+
+
+def body_readings(array: SensorArray, point: BodyPoint | None) -> FloatArray:
+    """Return the readings (C,) that a pose predicts, NaN without one."""
+    if point is None or not point.tracks:
+        return np.full(array.n_channels, np.nan)
+    poses = point.poses
+    fields = body_fields(point.body, array.positions, poses.position_m[0, 0], poses.R[0, 0])
+    return array.readings_of(fields) - array.channel_offset_T
+
+
+def magnet_segments(point: TrackPoint | SourcesPoint) -> FloatArray:
+    """Return lines (n, 2, 3) between all magnets of a body, none for other sources."""
+    body = body_of(point)
+    if body is None or not body.tracks:
+        return np.zeros((0, 2, 3))
+    places = np.array([magnet.position_m for magnet in body.tracks])
+    return np.stack([places[list(pair)] for pair in combinations(range(len(places)), 2)])
+
+
+def body_html(point: BodyPoint) -> str:
+    """Return the pose of a body with its standard deviations as HTML."""
+    poses = point.poses
+    lines = [f"time {point.time_s:.3f} s"]
+    if not point.tracks:
+        return texts.panel_html([*lines, f"<b>not tracked</b>: {escape(point.status)}"], warning=True)
+    turn = np.degrees(poses.rotation.as_rotvec()[0])
+    sigma = np.sqrt(np.diagonal(poses.covariance[0, 0]))
+    lines.append(f"{escape(point.status)} at {texts.position_text(poses.position_m[0, 0])}")
+    x, y, z = (length_text(each) for each in sigma[:3].tolist())
+    lines.append(f"σ x {x}, y {y}, z {z}")
+    lines.append(f"rotation vector ({', '.join(f'{each:.2f}' for each in turn)})°")
+    lines.append(f"σ of the rotation ({', '.join(f'{each:.2g}' for each in np.degrees(sigma[3:]))})°")
+    lines.append(f"NIS/dof {point.chi2:.3g}/{point.dof}")
+    return texts.panel_html([*lines, *map(escape, poses.flags[0])], warning=bool(poses.flags[0]))
+
+
 def sources_html(point: TrackPoint | SourcesPoint) -> str:
     """Return the states of the sources as HTML."""
+    body = body_of(point)
+    if body is not None:
+        return body_html(body)
     time = f"time {point.time_s:.3f} s"
     sources = sources_by_id(point)
     if SINGLE_ID in sources:

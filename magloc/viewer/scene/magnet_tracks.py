@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from magloc.bodies.body import MagnetBody
-from magloc.bodies.field import placed_magnets
 from magloc.bodies.poses import BodyPoses
-from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.live.body import magnet_points
+from magloc.tracking.results import TrackResult
 
 
 def magnet_tracks(body: MagnetBody, poses: BodyPoses) -> TrackResult:
@@ -16,13 +16,8 @@ def magnet_tracks(body: MagnetBody, poses: BodyPoses) -> TrackResult:
     ValueError
         No row has a pose.
     """
-    rows = poses.solved
-    if not rows.any():
+    points = magnet_points(body, poses)
+    if not points:
         raise ValueError("Input result must have a row with a pose; instead received none.")
-    places, moments = placed_magnets(body, poses.position_m[rows, 0], poses.R[rows, 0])
-    times = poses.time_s[rows].tolist()
-    tracks = [
-        tuple(TrackPoint(*point, status="tracked") for point in zip(times, *one, strict=True))
-        for one in zip(places.swapaxes(0, 1), moments.swapaxes(0, 1), strict=True)
-    ]
-    return TrackResult(tracks[0], False, tuple(range(1, len(tracks) + 1)), tuple(tracks[1:]), kind="magnet")
+    first, *others = zip(*points.values(), strict=True)
+    return TrackResult(first, False, tuple(range(1, len(others) + 2)), tuple(others), kind="magnet")

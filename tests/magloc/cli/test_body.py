@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -59,6 +60,17 @@ def test_a_stream_and_a_file_have_one_track(
         assert other["latency_ms"] > 0.0
 
 
+def test_a_stream_is_written_row_by_row(
+    truth: tuple[np.ndarray, np.ndarray], capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["live", *GIVEN.split(), "--from", "replay:r.csv", "--replay-speed", "1e6", "--out", "poses.csv"]
+    assert main(line) == 0
+    printed = [json.loads(line)["poses"][0]["position_m"] for line in capsys.readouterr().out.splitlines()]
+    rows = list(csv.DictReader(Path("poses.csv").read_text(encoding="utf-8").splitlines()))
+    np.testing.assert_allclose([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in rows], printed, rtol=1e-9)
+    assert {row["status"] for row in rows} == {"tracked"}
+
+
 def test_bounds_are_those_of_the_range(
     truth: tuple[np.ndarray, np.ndarray], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -75,7 +87,8 @@ def test_bounds_are_those_of_the_range(
         (f"locate r.csv {GIVEN} --region z>0", "--region: found together"),
         (f"track r.csv {GIVEN} --smooth", "--smooth: found together with --body"),
         (f"track r.csv {GIVEN} --sources 2", "--sources: found together with --body"),
-        (f"live {GIVEN} --from replay:r.csv --rest-s 1", "--rest-s: found together with --body"),
+        (f"live {GIVEN} --from replay:r.csv --sources 2", "--sources: found together with --body"),
+        (f"live {GIVEN} --from replay:r.csv --rest-s 1", "found no row in which the body can be tracked"),
         ("bounds --body b.toml", "--body: found no --array"),
         ("locate r.csv --array a.toml --body none.toml", "none.toml does not exist"),
     ],

@@ -10,11 +10,17 @@ import pytest
 
 from arrays.geometries import tetrahedron
 from arrays.io.errors import InputError
+from magloc.bodies.field import placed_magnets
+from magloc.bodies.track import BodyTrack
 from magloc.fields import dipole
+from magloc.live.body import body_points
+from magloc.live.follower import Follower
 from magloc.readings import Readings
 from magloc.tracking.results import SourcePoint, SourcesPoint, TrackPoint
 from magloc.viewer.live_view import LiveView
 from magloc.viewer.pages.live import SINGLE_ID
+from tests.magloc.bodies.devices import hall_ring, knob
+from tests.magloc.bodies.test_filter import record
 from tests.waiting import wait_for
 
 ARRAY = tetrahedron(1.5)
@@ -109,6 +115,31 @@ def test_several_sources_come_and_go(view: LiveView) -> None:
     assert not page._sources[1].dipole.frame.visible
     view.update(several_at(2.0))
     wait_for(lambda: "no source" in page._source_panel.content)
+
+
+def test_a_body_turns() -> None:
+    """Its magnets stand where rotations put them, with lines between; the residuals are noise."""
+    array, body = hall_ring(4, common_field_T=None), knob()
+    readings, position_m, R = record(array, body, 30, 60_55)
+    with LiveView(array, port=0, open=False) as view:
+        for point in Follower(array, body=body).follow(readings):
+            view.update(point)
+        page = view._live
+        wait_for(lambda: "time 0.145 s" in page._source_panel.content)
+        assert "σ of the rotation (" in page._source_panel.content
+        places, _ = placed_magnets(body, position_m[-1], R[-1])
+        for id, place in enumerate(places, start=1):
+            np.testing.assert_allclose(page._sources[id].dipole.frame.position, place, atol=5e-5)
+        ends = page._frame.points
+        np.testing.assert_allclose(
+            ends, [[places[0], places[1]], [places[0], places[2]], [places[1], places[2]]], atol=5e-5
+        )
+        wait_for(lambda: page._is_plotted)
+        shown = page._plot._values_nT("residuals of the differences")
+        assert np.nanstd(shown) < 2e-3 * np.nanstd(page._plot._values_nT("readings"))
+        view.update(body_points(body, BodyTrack.none(1))[0])
+        wait_for(lambda: "not tracked" in page._source_panel.content)
+        assert not page._frame.visible
 
 
 def test_the_window_is_as_long_as_it_says(view: LiveView) -> None:
