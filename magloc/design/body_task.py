@@ -30,7 +30,7 @@ A task file (TOML)::
     starts = 8                      # the given body, and random places
     refined = 2                     # best starts, which descend again on all poses
     poses = 512                     # a power of two; the starts descend on a quarter of them
-    iterations = 90                 # at most, of a refined descent; a third of them for the starts
+    iterations = 240                # at most, of a refined descent; a third of them for the starts
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class _Search(StartsTable, kw_only=True):
     starts: int = 8
     refined: int = 2
     poses: int = 512
-    iterations: Annotated[int, at_least(1)] = 90
+    iterations: Annotated[int, at_least(1)] = 240
 
     def check(self) -> None:
         super().check()
