@@ -61,7 +61,7 @@ class BodyTracker:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether a kernel makes the steps: that of dipoles."""
+        """True if a kernel makes the steps, as for dipoles."""
         return not self.body.has_shapes
 
     def restart(self) -> None:
