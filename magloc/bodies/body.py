@@ -205,12 +205,12 @@ class MagnetBody:
         """Moments of the magnets (K, 3) [A·m²]."""
         return np.array([magnet.moment_Am2 for magnet in self.magnets])
 
-    @property
+    @cached_property
     def centre_m(self) -> FloatArray:
         """Mean position of the magnets (3,) [m]."""
         return np.asarray(self.positions_m.mean(axis=0))
 
-    @property
+    @cached_property
     def radius_m(self) -> float:
         """Largest distance of a magnet from the mean position [m]."""
         return float(np.linalg.norm(self.positions_m - self.centre_m, axis=1).max())

@@ -101,6 +101,8 @@ class BodyLocator:
             parts.append((rows.index, self._fit(rows, ambient_T)))
             if progress is not None:
                 progress(len(rows))
+        if len(parts) == 1:  # its rows are all rows, in their order
+            return parts[0][1] if time_s is None else replace(parts[0][1], time_s=time_s)
         width = max((part.chi2.shape[1] for _, part in parts), default=1)
         poses = BodyPoses.none(len(readings), width, self.symmetry.words)
         for index, part in parts:
@@ -258,11 +260,12 @@ class BodyLocator:
         """Return whether optima (b, W) lie within the limits of the body, or three standard deviations beside them."""
         limits = self.body.limits
         variance = np.diagonal(optima.covariance, axis1=-2, axis2=-1)
-        factor = np.maximum(np.nan_to_num(optima.chi2) / max(dof, 1), 1.0)[..., None]
-        sigma = np.sqrt(np.nan_to_num(variance, nan=0.0) * factor)
+        factor = np.fmax(optima.chi2 / max(dof, 1), 1.0)[..., None]
+        sigma = np.sqrt(np.fmax(variance, 0.0) * factor)
         beyond_m = np.maximum(limits.low_m - optima.position_m, optima.position_m - np.array(limits.high_m))
-        cosine = 0.5 * (np.trace(optima.R, axis1=-2, axis2=-1) - 1.0)
-        beyond_rad = np.arccos(np.clip(cosine, -1.0, 1.0)) - limits.angle_rad
+        R = optima.R
+        cosine = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
+        beyond_rad = np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0)) - limits.angle_rad
         inside = (beyond_m <= _LIMIT_SIGMAS * sigma[..., :3]).all(axis=-1)
         return inside & (beyond_rad <= _LIMIT_SIGMAS * sigma[..., 3:].max(axis=-1)) & np.isfinite(optima.chi2)
 
@@ -285,6 +288,8 @@ class BodyLocator:
         """Name a missing magnet or a faulty sensor in rows that no pose fits, and take the pose without it."""
         dof = rows.n_differences - self.n_unknowns
         worst = np.nan_to_num(poses.chi2[:, 0], nan=np.inf) > quantile(dof, MISFIT)
+        if not worst.any():
+            return
         bad = np.flatnonzero(worst & is_detected(rows.energy, rows.n_differences) & ~rows.is_silent)
         if not bad.size:
             return
@@ -359,15 +364,14 @@ def _widened(poses: BodyPoses, width: int) -> BodyPoses:
 
 def _enlarged(poses: BodyPoses) -> BodyPoses:
     """Return poses with flags of doubtful covariances, which are enlarged where χ² is far beyond noise."""
-    limits = np.array([quantile(max(int(d), 1), MISFIT) for d in poses.dof])
-    for i in np.flatnonzero(poses.solved).tolist():
-        flags = list(poses.flags[i])
-        if not np.isfinite(poses.covariance[i, 0]).all():
-            flags.append("unknown")
-        if poses.dof[i] > 0 and poses.chi2[i, 0] > limits[i]:
-            flags.append("misfit")
-            poses.covariance[i] *= np.maximum(poses.chi2[i] / poses.dof[i], 1.0)[:, None, None]
-        poses.flags[i] = tuple(flags)
+    limits = {d: quantile(max(d, 1), MISFIT) for d in set(poses.dof.tolist())}
+    is_open = poses.solved & ~np.isfinite(poses.covariance[:, 0]).all(axis=(1, 2))
+    is_misfit = (poses.dof > 0) & (poses.chi2[:, 0] > np.array([limits[d] for d in poses.dof.tolist()]))
+    for i in np.flatnonzero(is_open).tolist():
+        poses.flags[i] = (*poses.flags[i], "unknown")
+    for i in np.flatnonzero(is_misfit).tolist():
+        poses.flags[i] = (*poses.flags[i], "misfit")
+        poses.covariance[i] *= np.maximum(poses.chi2[i] / poses.dof[i], 1.0)[:, None, None]
     return poses
 
 

@@ -39,6 +39,22 @@ def ranked(optima: RowOptima, length_m: float) -> RowOptima:
     """Return distinct optima within Δχ² 20 of the best, in order of χ²."""
     if optima.chi2.shape[1] == 1:
         return optima
+    several: BoolArray = np.asarray(np.isfinite(optima.chi2[:, 1:]).any(axis=1))
+    if several.all():
+        return _ranked(optima, length_m)
+    # Most rows have one optimum, in its place.
+    result = RowOptima(*(values.copy() for values in vars(optima).values()))
+    if several.any():
+        result.put(several, _ranked(RowOptima(*(values[several] for values in vars(optima).values())), length_m))
+    known = np.isfinite(result.chi2)
+    for values in vars(result).values():
+        values[~known] = np.nan
+    most = max(int(known.sum(axis=1).max()), 1)
+    return RowOptima(*(values[:, :most] for values in vars(result).values()))
+
+
+def _ranked(optima: RowOptima, length_m: float) -> RowOptima:
+    """Return :func:`ranked` of rows with several optima."""
     chi2 = np.where(np.isfinite(optima.chi2), optima.chi2, np.inf)
     order = np.argsort(chi2, axis=1, kind="stable")
     chi2 = np.take_along_axis(chi2, order, axis=1)

@@ -220,5 +220,7 @@ def search_poses(
     )
     core.run("search_poses", work, n, block=_ROWS_A_BLOCK)
     most = max(int(counts[:, 0].max(initial=0)), 1)
-    position, R = unpacked(model, pose[:, :most])
-    return PoseOptima(position, R, chi2[:, :most], _covariances(model, covariance[:, :most], R), counts)
+    (position, R), chi2 = unpacked(model, pose[:, :most]), chi2[:, :most]
+    known, of_places = np.isfinite(chi2), np.full((n, most, 6, 6), np.nan)
+    of_places[known] = _covariances(model, covariance[:, :most][known], R[known])
+    return PoseOptima(position, R, chi2, of_places, counts)

@@ -12,6 +12,8 @@ from arrays.array import SensorArray
 from arrays.geometries import grid, tetrahedron
 from arrays.sensor import Sensor
 from magloc import core
+from magloc.bodies.filter import BodyTracker
+from magloc.bodies.locator import BodyLocator
 from magloc.directions import fibonacci_directions
 from magloc.fields.shapes import Shape, aligned_fields
 from magloc.localization.search.candidates import candidate_positions
@@ -21,6 +23,8 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 from magloc.measurement.rows import whitened_rows
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
+from tests.magloc.bodies.devices import hall_ring, knob, random_poses, readings_of
+from tests.magloc.bodies.test_filter import record
 from tests.plain_locator import plain_locator
 
 TITLE = "fix: tetrahedron of 1.5 m, 1 nT, source of 300 A·m² at 2-8 m, no start given"
@@ -75,6 +79,7 @@ def rows(size: Size) -> Iterator[Row]:
             )
     yield Row(f"a fix, {size.rows:,} at once, {threads} thr.", timings["all threads"])
     yield from magnets(size)
+    yield from bodies(size)
     yield from growth(size)
 
 
@@ -95,6 +100,42 @@ def magnets(size: Size) -> Iterator[Row]:
         yield Row(
             f"a {magnet.kind} near, {size.rows:,} at once, 1 thr.", timings["magnet"], "a dipole", timings["dipole"]
         )
+
+
+def bodies(size: Size) -> Iterator[Row]:
+    """A body of three magnets over three sensors, beside a dipole at the same sensors."""
+    rng, array, body = np.random.default_rng(7), hall_ring(), knob()
+    few = range(min(size.problems, size.rows))
+    position, R = random_poses(body, size.rows, rng)
+    readings = readings_of(array, body, position, R, rng)
+    moment = 0.05 * random_directions(rng, size.rows)
+    of_dipoles = predicted_channels(array, position, moment)
+    of_dipoles += array.channel_noise_T * rng.normal(size=of_dipoles.shape)
+    moving = record(array, body, size.rows, 7)[0]
+    locator, dipoles = BodyLocator(array, body), plain_locator(array, body_length_m=0.0)
+    tracker = BodyTracker(array, body)
+
+    def track() -> None:
+        tracker.restart()
+        tracker.follow(moving.values_T, moving.time_s)
+
+    timings = interleaved(
+        {
+            "body alone": Contestant(lambda: [locator.fit_rows(readings[i : i + 1]) for i in few], 1, len(few)),
+            "dipole alone": Contestant(lambda: [dipoles.fit(of_dipoles[i]) for i in few], 1, len(few)),
+            "body": Contestant(lambda: locator.fit_rows(readings), 1, size.rows),
+            "dipole": Contestant(lambda: dipoles.fit_rows(of_dipoles), 1, size.rows),
+            "track": Contestant(track, 1, size.rows),
+        },
+        size.rounds,
+    )
+    found = int(locator.fit_rows(readings).solved.sum())
+    for what, ours, peer in (
+        ("a body of three magnets, one alone", "body alone", "dipole alone"),
+        (f"a body, {size.rows:,} at once", "body", "dipole"),
+        (f"a body, {size.rows:,} rows tracked", "track", "dipole"),
+    ):
+        yield Row(f"{what}, 1 thr.", timings[ours], f"fix of {peer}", timings[peer], f"poses {found}/{size.rows}")
 
 
 def growth(size: Size) -> Iterator[Row]:

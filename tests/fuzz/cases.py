@@ -84,12 +84,19 @@ LINES: dict[str, tuple[str, ...]] = {
         "--array log.toml --from replay:log.csv --replay-speed 1e6",
         "--array turned.toml --from replay:turned.csv --replay-speed 1e6 --calibrate --out-array out.toml",
         "--array body-array.toml --body body.toml --from replay:body.csv --replay-speed 1e6",
+        "--array body-array.toml --body body.toml --from replay:body.csv --replay-speed 1e6 --rest-s 0.2 --out out.csv",
     ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
         "passing.csv --array passing-array.toml --object-path passing-path.csv --eddy --attitude-sigma-deg 1",
     ),
-    "magloc calibrate": ("readings.csv --array array.toml --truth readings-truth.csv --out out.toml --json",),
+    "magloc calibrate": (
+        "readings.csv --array array.toml --truth readings-truth.csv --out out.toml --json",
+        "body.csv --array body-array.toml --body body.toml --truth body-truth.csv --json"
+        " --magnet-position-prior-mm 0.2",
+        "body.csv --array body-array.toml --body body.toml --truth body-truth.csv --free-rows"
+        " --magnet-strength-prior 0.03 --out-array out.toml --out-body out-body.toml",
+    ),
     "magloc map": (
         "paper --grid 3 --out out --json",
         "map.toml --method iekf --grid 3 --out out",
@@ -406,10 +413,15 @@ def _write_body(folder: Path) -> None:
     """Readings of a knob with three magnets over three sensors, with the files of both."""
     array, body = hall_ring(), knob()
     rng = np.random.default_rng(0)
-    values_T = readings_of(array, body, *random_poses(body, 10, rng), rng)
+    position_m, R = random_poses(body, 10, rng)
+    values_T = readings_of(array, body, position_m, R, rng)
     arrays.write_array(folder / "body-array.toml", array)
     write_body(folder / "body.toml", body)
-    write_readings(folder / "body.csv", Readings(values_T, time_s=0.1 * np.arange(10)), array)
+    times = 0.1 * np.arange(10)
+    write_readings(folder / "body.csv", Readings(values_T, time_s=times), array)
+    of_truth = np.column_stack([times, position_m, Rotation.from_matrix(R).as_quat()])
+    names = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    write_columns(dict(zip(names, of_truth.T, strict=True)), folder / "body-truth.csv")
 
 
 def _write_magarrow(folder: Path) -> None:
