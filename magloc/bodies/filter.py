@@ -152,7 +152,10 @@ class BodyTracker:
         if not a:
             return np.zeros((len(group), 0, group.y.shape[1]))
         whitening = whitenings_of(self._white, group.mask, group.readings_T)
-        of_rows = np.array([self._errors.effect(self.array, row) for row in group.readings_T])  # (b, C, a)
+        if self._errors.has_induced:
+            of_rows = np.array([self._errors.effect(self.array, row) for row in group.readings_T])
+        else:
+            of_rows = self._errors.effect(self.array, group.readings_T)  # (b, C, a)
         unit = np.stack([whitening.of_unit_noise(of_rows[..., e]) for e in range(a)], axis=-1)
         return np.ascontiguousarray(group.model.whiten(unit).transpose(0, 2, 1))
 

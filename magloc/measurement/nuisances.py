@@ -153,6 +153,11 @@ class SensorErrors:
         return bool(fields.all() and not self.is_slope.any() and not self.array.channel_is_scalar.any())
 
     @property
+    def has_induced(self) -> bool:
+        """True if an error is that of an induced field or of eddy currents."""
+        return bool((self.of_sensor[:, 1] >= _INDUCED).any())
+
+    @property
     def depends_on_field(self) -> bool:
         """True if an effect is proportional to the field at the sensor, as for gains and rotations."""
         return bool((self.of_sensor[:, 1] < _FIELD).any())
@@ -166,27 +171,29 @@ class SensorErrors:
     def effect(
         self, array: SensorArray, readings_T: FloatArray, time_s: float = 0.0, rate_rad_s: FloatArray | None = None
     ) -> FloatArray:
-        """Return the derivative (C, n) of one row's readings (C,) [T] by the errors.
+        """Return the derivative (..., C, n) of readings (..., C) [T] by the errors.
 
-        It is finite for missing readings too. The array rotates at a rate (3,) about its own axes.
+        It is finite for missing readings too. Induced fields take one row at a time. The array rotates at a rate (3,)
+        about its own axes.
         """
-        effect = np.zeros((array.n_channels, self.n_states))
+        effect = np.zeros((*readings_T.shape[:-1], array.n_channels, self.n_states))
         n = len(self.of_sensor)
         if n:
             sensor, column = self.of_sensor.T
             known = (column >= _FIELD).all()
-            of_axes = np.zeros((array.n_sensors, 3, _FIELD)) if known else calibration_errors(array, readings_T)
+            of_rows = (*readings_T.shape[:-1], array.n_sensors, 3)
+            of_axes = np.zeros((*of_rows, _FIELD)) if known else calibration_errors(array, readings_T)
             of_field = _field_jacobian(array)
-            of_axes = np.concatenate([of_axes, of_field], axis=-1)
-            if (column >= _INDUCED).any():
+            of_axes = np.concatenate([of_axes, np.broadcast_to(of_field, (*of_rows, 3))], axis=-1)
+            if self.has_induced:
                 ambient_T = ambient_in_array(array, readings_T)
                 change_T_s = np.zeros(3) if rate_rad_s is None else np.cross(ambient_T, rate_rad_s)
                 induced = [matrix_effects(of_field, field) for field in (ambient_T, change_T_s)]
                 of_axes = np.concatenate([of_axes, *induced], axis=-1)
             channel = array.sensor_channels[sensor]
             state, axis = np.nonzero(channel >= 0)
-            effect[channel[state, axis], state] = of_axes[sensor[state], axis, column[state]]
-        effect[self.of_channel, n + np.arange(self.of_channel.size)] = np.where(
+            effect[..., channel[state, axis], state] = of_axes[..., sensor[state], axis, column[state]]
+        effect[..., self.of_channel, n + np.arange(self.of_channel.size)] = np.where(
             self.is_slope, time_s - self.about_s, 1.0
         )
         return effect
