@@ -293,7 +293,7 @@ PICTURES: dict[str, Picture] = {
         ),
     ),
     "card-locate.png": Panel("notebook-03-real-magnet.png", (12, 58, 296, 326)),
-    "card-track.png": Panel("notebook-05-tracking.png", (434, 362, 852, 562)),
+    "card-track.png": Panel("notebook-05-tracking.png", (426, 362, 852, 562)),
     "card-survey.png": Panel("survey-map.png", (58, 46, 409, 230)),
     "card-live.png": Panel("hall-board.png", (272, 62, 722, 510)),
     "card-calibrate.png": Panel("notebook-08-calibration.png", (24, 6, 330, 168)),
