@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 import arrays
 from arrays.io.errors import InputError, naming
-from arrays.io.outputs import refuse_unwritable, write_files
+from arrays.io.outputs import refuse_one_for_two, refuse_unwritable, write_files
 from arrays.io.tables import align
 from magloc.cli.calibration.sensors import (
     PriorOptions,
@@ -83,6 +83,7 @@ def calibrate_body(
         raise InputError("--body: found none, expected the body file that the other options of a body refer to.")
     if options.free_rows and files.truth is None:
         raise InputError("--free-rows: found no --truth; without it all rows are free.")
+    refuse_one_for_two({"--out": files.out, "--out-body": options.out_body})
     refuse_unwritable(options.out_body, "--out-body")
     refuse_not_positive(options, "magnet_position_prior_mm", "magnet_strength_prior", "magnet_direction_prior_deg")
     refuse_outside(0.0, 1.0, "at most 1", magnet_strength_prior=options.magnet_strength_prior)

@@ -101,6 +101,10 @@ class TestRefusals:
             (("--free-rows",), "--body: found none"),
             (("--body", "knob.toml", "--moment", "free"), "--body: found together with"),
             (("--body", "knob.toml", "--free-rows"), "--free-rows: found no --truth"),
+            (
+                ("--body", "knob.toml", "--out", "new.toml", "--out-body", "new.toml"),
+                "--out-body new.toml: found the file of",
+            ),
             (("--body", "knob.toml", "--magnet-position-prior-mm", "0"), "--magnet-position-prior-mm: found 0"),
             ((), "--out: found none, expected the array file to write"),
         ],
