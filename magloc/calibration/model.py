@@ -162,8 +162,7 @@ class CalibrationProblem(SensorProblem[CalibrationState]):
     def row_priors(self, state: CalibrationState) -> tuple[FloatArray, FloatArray]:
         """Return 1/σ (T, n) of the prior of the rows' unknowns, 0 without one, and their deviations (T, n) from it."""
         weight, deviation = np.zeros((2, len(state.position_m), self.n_row_unknowns))
-        sigma_T = self.array.common_field_T
-        weight[:, -3:] = 0.0 if sigma_T is None else 1.0 / max(sigma_T, 1e-15)
+        weight[:, -3:] = self.common_weight
         deviation[:, -3:] = state.common_T
         if self.path_m is not None and self.path_sigma_m is not None:
             weight[:, :3] = 1.0 / np.maximum(self.path_sigma_m, _EXACT_M)[:, None]
@@ -172,9 +171,7 @@ class CalibrationProblem(SensorProblem[CalibrationState]):
 
     def after_step(self, state: CalibrationState, step: FloatArray, of_rows: FloatArray) -> CalibrationState:
         """Return a state after a step (P,) of sensors and source, and (T, n) of the rows."""
-        n = int(self.free.sum())
-        sensors = state.sensors.copy()
-        sensors[self.free] += self.prior[self.free] * step[:n]
+        sensors, of_source = self.sensors_after_step(state, step)
         position, height, moment = state.position_m, state.height_m, state.moment_Am2
         if self.unknown_position:
             # A source that jumps far away would not return, because its field and all derivatives vanish.
@@ -183,11 +180,11 @@ class CalibrationProblem(SensorProblem[CalibrationState]):
             of_rows = of_rows * (radius / np.maximum(length, radius))
             position = position + of_rows[:, :3]
         if self.unknown_height:
-            height = height + float(step[-1])
+            height = height + float(of_source[-1])
         if self.moment == "free":
             moment = moment + of_rows[:, -6:-3]
         elif self.moment == "constant":
-            moment = moment + step[n : n + 3]
+            moment = moment + of_source[:3]
         elif self.axis is not None:
-            moment = moment + step[n] * self.axis
+            moment = moment + of_source[0] * self.axis
         return CalibrationState(sensors, position, height, moment, state.common_T + of_rows[:, -3:])

@@ -21,6 +21,7 @@ POSITION, GAINS, AXES, OFFSET = slice(0, 3), slice(3, 6), slice(6, 12), slice(12
 AXIS_PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 """Channel and component of the six axis unknowns."""
 _CHANNEL, _COMPONENT = (list(places) for places in zip(*AXIS_PAIRS, strict=True))
+_EXACT_T = 1e-15  # least standard deviation of the common field
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +111,12 @@ class SensorProblem(ABC, Generic[State]):
         return float(np.hypot(deviations[:, GAINS].max(), displaced))
 
     @property
+    def common_weight(self) -> float:
+        """1/σ of the prior of the common field, per axis [1/T]; 0 without a prior."""
+        sigma_T = self.array.common_field_T
+        return 0.0 if sigma_T is None else 1.0 / max(sigma_T, _EXACT_T)
+
+    @property
     def estimated_indices(self) -> NDArray[np.intp]:
         """Indices of the estimated unknowns among the 15 N of the sensors and the g that all rows share."""
         n = self.free.size
@@ -134,6 +141,13 @@ class SensorProblem(ABC, Generic[State]):
     def shared_deviations(self, state: State) -> FloatArray:
         """Return the estimated shared unknowns that have a prior (p,), in standard deviations; they come first."""
         return np.asarray((state.sensors / self.prior)[self.free])
+
+    def sensors_after_step(self, state: State, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the sensors' unknowns (N, 15) after a step (P,), and the part of the step of the other unknowns."""
+        n = int(self.free.sum())
+        sensors = state.sensors.copy()
+        sensors[self.free] += self.prior[self.free] * step[:n]
+        return sensors, step[n:]
 
     def residual_rms_T(self, state: State) -> FloatArray:
         """Return the root mean square (N,) of every sensor's residuals [T]."""

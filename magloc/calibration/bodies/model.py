@@ -115,8 +115,7 @@ class BodyProblem(SensorProblem[BodyState]):
         weight = np.zeros((len(self.pose_m), 9))
         weight[:, :3] = 1.0 / np.maximum(sigma_m, _EXACT_M)[:, None]
         weight[:, 3:6] = 1.0 / np.maximum(sigma_rad, _EXACT_RAD)[:, None]
-        if self.array.common_field_T is not None:
-            weight[:, 6:] = 1.0 / max(self.array.common_field_T, 1e-15)
+        weight[:, 6:] = self.common_weight
         return weight
 
     def row_priors(self, state: BodyState) -> tuple[FloatArray, FloatArray]:
@@ -166,12 +165,10 @@ class BodyProblem(SensorProblem[BodyState]):
 
     def after_step(self, state: BodyState, step: FloatArray, of_rows: FloatArray) -> BodyState:
         """Return a state after a step (P,) of sensors and magnets, and (T, 9) of the rows."""
-        n = int(self.free.sum())
-        sensors = state.sensors.copy()
-        sensors[self.free] += self.prior[self.free] * step[:n]
+        sensors, of_magnets = self.sensors_after_step(state, step)
         magnets = state.magnets
         if self.magnets_free:
-            magnets = magnets + self.magnet_prior * step[n:].reshape(magnets.shape)
+            magnets = magnets + self.magnet_prior * of_magnets.reshape(magnets.shape)
         # A body that jumps far away would not return, because its field and all derivatives vanish.
         shift = _shortened(of_rows[:, :3], self.array.circumradius)
         turn = _shortened(of_rows[:, 3:6], _LONGEST_TURN_RAD)
