@@ -111,10 +111,10 @@ class Shape:
         """Number of the shape, and its size, for kernels."""
         half = [0.5 * size for size in self.size_m]
         if self.kind == "cuboid":
-            return 0, (half[0], half[1], half[2])
+            return 1, (half[0], half[1], half[2])
         if self.kind == "sphere":
-            return 2, (half[0], 0.0, 0.0)
-        return 1, (half[0] if self.kind == "ring" else 0.0, half[-2], half[-1])
+            return 3, (half[0], 0.0, 0.0)
+        return 2, (half[0] if self.kind == "ring" else 0.0, half[-2], half[-1])
 
 
 def shape_fields(shape: Shape, points_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:

@@ -142,7 +142,7 @@ class Rows:
         """Arguments of kernels."""
         array, order = self.array, np.arange(len(self.readings))
         magnet = magnet_of(array)
-        shape, size = (-1, (0.0, 0.0, 0.0)) if magnet is None else magnet.kernel_size
+        shape, size = (0, (0.0, 0.0, 0.0)) if magnet is None else magnet.kernel_size
         return core.problem(
             "rows",
             n_sensors=array.n_sensors,

@@ -43,8 +43,8 @@ int64_t magloc_dipole_gradients(const magloc_dipoles *problem, int64_t begin, in
 /* Field of a uniformly magnetised body and its derivatives at points outside it, in the body's frame; an item is a
    point. Inside the body and on its surface everything is NaN. */
 typedef struct {
-  int64_t n_points, shape; /* 0: cuboid, 1: cylinder or ring about z, 2: sphere */
-  double size[3];          /* halves of the edges; inner radius, outer radius, half height; radius, 0, 0 */
+  int64_t n_points, shape; /* 0: dipole, 1: cuboid, 2: cylinder or ring about z, 3: sphere */
+  double size[3];          /* 0; halves of the edges; inner radius, outer radius, half height; radius, 0, 0 */
   const double *points;    /* (n_points, 3): from the body's centre */
   const double *moments;   /* (n_points, 3) */
   double *fields;          /* (n_points, 3) */
@@ -590,7 +590,7 @@ typedef struct {
   const int64_t *ambient_of_row;   /* (n_rows) */
   const double *pose_effects;      /* (n_rows, 12, n_pose) of errors of the pose on turn, place, lever arm, ambient */
   double lever_arm[3];             /* from the pose's reference point to the array's origin, in the array's axes */
-  int64_t shape;                   /* of the sources, as of magloc_aligned_magnets; -1: dipoles */
+  int64_t shape;                   /* of the sources, as of magloc_aligned_magnets */
   double size[3];
 } magloc_rows;
 

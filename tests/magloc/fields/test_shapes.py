@@ -7,6 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from magloc import core
 from magloc.fields import dipole
 from magloc.fields.shapes import Shape, fields_or_nan, shape_fields, shape_jacobians
 from tests.oracles import derivative
@@ -233,6 +234,17 @@ class TestInside:
         for moment in MOMENTS:
             expected = magpylib_field(shape, points, moment)
             assert relative(shape_fields(shape, points, moment), expected).max() < 1e-10
+
+
+def test_a_problem_without_a_shape_is_a_dipole() -> None:
+    points, moments = np.random.default_rng(12).standard_normal((2, 50, 3))
+    field, slopes, unused = np.empty((50, 3)), np.empty((50, 3, 3)), np.empty((50, 3, 3))
+    results = {"fields": field, "gradients": slopes, "matrices": unused}
+    work = core.problem("magnets", n_points=50, shape=0, size=(0.0,) * 3, points=points, moments=moments, **results)
+    core.run("shape_fields", work, 50, block=50)
+    np.testing.assert_allclose(
+        field, dipole.field(points, 0.0 * points, moments), rtol=0, atol=1e-12 * abs(field).max()
+    )
 
 
 class TestShape:

@@ -4,6 +4,11 @@
 #include "shapes.hpp"
 
 MAGLOC_BEGIN
+// Number of a shape in magloc.h. A dipole is a sphere without a size.
+struct Shape {
+  enum : int64_t { dipole, cuboid, ring, sphere };
+};
+
 // A body's shape, and the distance from which its field is a series.
 template <class T>
 class MagnetBody {
@@ -30,16 +35,17 @@ class MagnetBody {
   MagnetBody(int64_t shape, const double (&size)[3]) : shape_(shape), multipoles_{} {
     double longest = 0.0;
     for (int i = 0; i < 3; ++i) size_[i] = size[i], longest = maximum(longest, 2.0 * size_[i]);
-    if (shape_ == 1) fill_multipoles(size_, multipoles_);
+    if (shape_ == Shape::ring) fill_multipoles(size_, multipoles_);
     // The errors of the series and of the rounding in the closed forms cross there, near 1e-11.
-    far_square_ = shape_ == 1 ? 100.0 * (size_[1] * size_[1] + size_[2] * size_[2]) : 225.0 * longest * longest;
+    far_square_ =
+        shape_ == Shape::ring ? 100.0 * (size_[1] * size_[1] + size_[2] * size_[2]) : 225.0 * longest * longest;
   }
 
   MAGLOC_INLINE void fill(const T (&d)[3], PotentialDerivatives<T> &phi) const {
-    if (shape_ == 0)
+    if (shape_ == Shape::cuboid)
       fill(
           d, phi, [&](auto &near) { fill_cuboid(size_, d, near); }, [&](auto &far) { fill_far_cuboid(size_, d, far); });
-    else if (shape_ == 1)
+    else if (shape_ == Shape::ring)
       fill(
           d, phi, [&](auto &near) { fill_ring(size_, d, near); },
           [&](auto &far) { fill_far_ring(multipoles_, d, far); });
@@ -67,7 +73,7 @@ class MagnetBody {
 
   // Mean over rolls of a cuboid of equal edges across z: over four, which leaves a sixteenth harmonic.
   MAGLOC_INLINE void fill_mean(const T (&d)[3], PotentialDerivatives<T> &phi) const {
-    if (shape_ != 0) {
+    if (shape_ != Shape::cuboid) {
       fill(d, phi);
       return;
     }
@@ -80,9 +86,9 @@ class MagnetBody {
   // How far outside a point is, in one of the coordinates that bound the body; not above zero inside.
   MAGLOC_INLINE T outside(const T (&d)[3]) const {
     const T s = d[0] * d[0] + d[1] * d[1], rho = square_root(s);
-    if (shape_ == 2) return square_root(s + d[2] * d[2]) - size_[0];
+    if (shape_ == Shape::dipole || shape_ == Shape::sphere) return square_root(s + d[2] * d[2]) - size_[0];
     const T along = absolute(d[2]) - size_[2];
-    if (shape_ == 1) return maximum(along, maximum(rho - size_[1], size_[0] - rho));
+    if (shape_ == Shape::ring) return maximum(along, maximum(rho - size_[1], size_[0] - rho));
     return maximum(along, maximum(absolute(d[0]) - size_[0], absolute(d[1]) - size_[1]));
   }
 };

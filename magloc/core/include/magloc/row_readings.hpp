@@ -26,8 +26,8 @@ class RowReadings {
   double true_rotation_[9], turn_of_change_[3][3], by_field_[3][3];  // where the pose has errors
   int64_t *const first_ = space_.take<int64_t>(n_), *const end_ = space_.take<int64_t>(n_);
   bool has_modulus_ = false, is_sparse_ = false;
-  const MagnetBody<T> body_{maximum(p_.shape, (int64_t)0), p_.size};  // of all sources, unless they are dipoles
-  int64_t row_ = -1;                                                  // whose readings are loaded
+  const MagnetBody<T> body_{p_.shape, p_.size};  // of all sources
+  int64_t row_ = -1;                             // whose readings are loaded
 
  public:
   Padded<T> effect{space_, p_.n_nuisances, k_};  // of nuisances on the readings
@@ -159,7 +159,7 @@ class RowReadings {
       if (has_modulus_) fill_gain_of_modulus(r, gain);
       T value = dot(gain, ambient);
       for (int64_t k = 0; k < n_sources_; ++k) {
-        if (p_.shape >= 0) {
+        if (p_.shape != Shape::dipole) {
           value += add_magnet<with_slopes>(r, k, gain);
           continue;
         }
@@ -298,7 +298,7 @@ class RowReadings {
     T b[3], of_source[3];
     for (int i = 0; i < 3; ++i) b[i] = ambient_.lanes(i)[r];
     for (int64_t k = 0; k < n_sources_; ++k) {
-      if (p_.shape < 0) {
+      if (p_.shape == Shape::dipole) {
         field(ray_to(r, k), *reinterpret_cast<const double (*)[3]>(sources_ + 6 * k + 3), of_source);
         for (int i = 0; i < 3; ++i) b[i] += of_source[i];
       } else {

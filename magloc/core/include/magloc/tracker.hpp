@@ -191,7 +191,6 @@ class Tracker {
   TrackerStatus follow(double dt, int count, bool is_new) {
     const int64_t zero = 0;
     magloc_rows rows = {};
-    rows.shape = -1;  // dipoles
     rows.n_sensors = n, rows.n_channels = n_channels, rows.n_readings = most_readings;
     rows.sensors = config_.position_m[0], rows.radius = radius_;
     __builtin_memcpy(rows.array_centroid, centroid_, sizeof centroid_);
