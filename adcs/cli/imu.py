@@ -92,7 +92,8 @@ def _calibrated(data: ImuLog, path: Path) -> ImuLog:
 
     array = read_array(path)
     if len(array.sensors) != 1 or array.sensors[0].kind != "vector":
-        raise InputError(f"{path}: found {array.n_sensors} sensors, expected one vector sensor (--calibration).")
+        found = ", ".join(f"{sensor.id} ({sensor.kind})" for sensor in array.sensors)
+        raise InputError(f"{path}: found sensors {found}, expected one vector sensor (--calibration).")
     field_T = array.calibrated_field(data.record.field_T)[:, 0]
     return replace(data, record=replace(data.record, field_T=field_T))
 

@@ -296,7 +296,7 @@ class Estimate:
     @cached_property
     def thrust(self) -> FloatArray:
         """Direction (K - 1, 3) of the thrust, which is that of the mean specific force in body axes, world frame."""
-        mean = np.nanmean(self.problem.inertial.acceleration_m_s2, axis=0)
+        mean = self.problem.inertial.acceleration_m_s2.mean(axis=0)
         return np.asarray(self.mean_force[2] @ (mean / np.linalg.norm(mean)))
 
     def thrust_speed(self, noise: Noise) -> FloatArray:

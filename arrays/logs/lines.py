@@ -77,9 +77,9 @@ def header_and_rows(
     rows = text[start:]
     found = [f"the header is on line {number}"] if number > 1 and line else []
     labels = list(_labels(rows, first, columns))
-    marks = [re.escape(mark) + (_NOT_WORDS if mark == "#" else "") for mark in (*columns.comment, *columns.skip)]
-    headers = re.escape(line) + "$" if line else ""
     begins = (*columns.comment, *columns.skip)
+    marks = [re.escape(mark) + (_NOT_WORDS if mark == "#" else "") for mark in begins]
+    headers = re.escape(line) + "$" if line else ""
     for called, pattern, words in (
         ("repeated headers", headers, (line,)),
         ("remarks and names", "|".join(marks), begins),

@@ -226,9 +226,9 @@ class Quality(Result):
         else:
             yield check("lag", math.nan, "ms", "not determined by this log")
         if self.clock is not None:
-            is_told = self.clock.s and (self.clock.is_leap or not is_late)
+            is_shifted = self.clock.s != 0.0 and (self.clock.is_leap or not is_late)
             share = 100.0 * max(self.clock.agreement_now, 0.0)
-            yield check("agreement of lines", share, "%", self.clock.remark if is_told else "")
+            yield check("agreement of lines", share, "%", self.clock.remark if is_shifted else "")
 
     def _way(self) -> Iterator[Check]:
         def check(name: str, value: float, unit: str, remark: str = "") -> Check:

@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from arrays.typing import FloatArray, IntArray
 from magloc.navigation.flight_lines import FlightLine, covers_area, line_spacing
+from magloc.navigation.poses import vectors_at
 
 _ALONG = 0.25  # way between rows that are used, in spacings of lines
 _MOST_ROWS = 40_000
@@ -24,8 +25,9 @@ _LEAST_S = 0.15  # a shorter shift is that of a spacing of the grid
 
 
 class ClockShift(NamedTuple):
-    """Time to add to that of the readings for their places, 0 if the lines agree as they are.
+    """Shift of the places' clock with which neighbouring lines agree.
 
+    ``s``: a reading at time t belongs to the place that the log has at t + s; 0 if the lines agree as they are.
     ``agreement`` and ``agreement_now``: share of the variance that neighbouring lines have in common, with the shift
     and without it.
     """
@@ -62,10 +64,10 @@ class ClockShift(NamedTuple):
 def clock_shift(
     time_s: FloatArray, place_m: FloatArray, values_T: FloatArray, lines: Sequence[FlightLine]
 ) -> ClockShift | None:
-    """Return the shift of the places' clock with which neighbouring lines agree; None if no shift can be told.
+    """Return the shift of the places' clock with which neighbouring lines agree; None if the lines do not determine it.
 
     Anomalies of neighbouring lines stand beside each other if the clocks agree, and apart by twice the way in the
-    time of the shift if they do not. Tried are lags up to 1.5 s, 18 s and whole hours, both ways.
+    time of the shift if they do not. The candidates are lags up to 1.5 s, 18 s and whole hours, both ways.
 
     Parameters
     ----------
@@ -89,11 +91,11 @@ def clock_shift(
 
     def neighbours(shift_s: float) -> tuple[FloatArray, FloatArray]:
         """Return distances (k,) of the nearest places on opposite lines, and the values (2, k) of both."""
-        after = np.clip(np.searchsorted(time_s, time_s[rows] + shift_s), 1, len(time_s) - 1)
         wanted_s = time_s[rows] + shift_s
+        after = np.clip(np.searchsorted(time_s, wanted_s), 1, len(time_s) - 1)
         known = (wanted_s >= time_s[0]) & (wanted_s <= time_s[-1])
         known &= (line[after] == line[after - 1]) & (line[after] >= 0)
-        at = np.stack([np.interp(wanted_s, time_s, axis) for axis in place_m[:, :2].T], axis=-1)
+        at = vectors_at(wanted_s, time_s, place_m[:, :2])
         there, here = (np.flatnonzero(known & (direction[after] == sign)) for sign in (1.0, -1.0))
         if not len(there) or not len(here):
             return np.zeros(0), np.zeros((2, 0))

@@ -52,7 +52,7 @@ class Trial(NamedTuple):
 
 
 def shift_of_places(array: SensorArray, readings: Readings) -> ClockShift | None:
-    """Return the time of the places with which lines flown in opposite directions agree; None if they cannot tell."""
+    """Return the shift of the places' clock with which opposite lines agree; None if they do not determine it."""
     place_m = readings.array_position_m
     if place_m is None or not len(readings):
         return None

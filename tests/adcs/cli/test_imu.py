@@ -80,6 +80,11 @@ class TestImu:
         mended = json.loads(adcs("imu", tmp_path / "iron.csv", "--calibration", tmp_path / "mag.toml", "--json").out)
         assert mended["total_rms_deg"] == pytest.approx(clean["total_rms_deg"], rel=1e-6)
 
+    def test_calibration_of_a_scalar_sensor(self, adcs, log, tmp_path):
+        sensor = Sensor("total", "scalar", (0.0, 0.0, 0.0), 1e-9)
+        write_array(tmp_path / "mag.toml", SensorArray((sensor,), common_field_T=7e-5))
+        assert_refused(adcs("imu", log, "--calibration", tmp_path / "mag.toml"), "found sensors total (scalar)")
+
     def test_words(self, adcs, log):
         outcome = adcs("imu", log, "--offline", "--quiet")
         first, second = outcome.out.splitlines()

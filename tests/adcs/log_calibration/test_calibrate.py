@@ -251,7 +251,7 @@ class TestFaults:
 
 
 def test_soft_iron_is_the_symmetric_factor_of_the_matrix():
-    """Of trace 3; the oracle is SciPy's root of the matrix times its transpose."""
+    """Its trace is 3; the oracle is SciPy's root of the matrix times its transpose."""
     _, found = calibrated(7, SHORT)
     root = sqrtm(found.matrix(0) @ found.matrix(0).T)
     values = {entry["name"]: entry["value"] for entry in found.entries}

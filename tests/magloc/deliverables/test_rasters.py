@@ -41,7 +41,7 @@ class TestGridRows:
         assert grid_rows(survey.rows, survey.rows.anomaly_T, frame, 0.5).cell_m == 0.5
 
     def test_the_residual_has_no_offset(self, survey: magloc.Survey) -> None:
-        """And both maps still differ by the targets' fields."""
+        """Both maps still differ by the targets' fields."""
         levelled = survey.levelled_rows
         assert abs(np.median(levelled.residual_T)) < 1e-15
         fields_T = survey.rows.anomaly_T - survey.rows.residual_T
