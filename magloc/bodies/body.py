@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from arrays.sensor import _finite, _not_negative
 from arrays.typing import FloatArray, Vector
+from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.fields.shapes import Shape
 
 LARGEST_REMANENCE_T = 2.0
 """Remanence beyond that of all magnets [T]; the best of NdFeB have 1.5 T."""
 NDFEB_PER_K = -1.1e-3
 """Relative change of the moment of NdFeB magnets per kelvin."""
-_MU0 = 4e-7 * math.pi
+_MU0 = 4.0 * math.pi * MU0_OVER_4PI
 _SAME_PLACE = 1e-6
 
 
@@ -85,6 +86,11 @@ class Magnet:
     def modulus_Am2(self) -> float:
         """Modulus of the moment [A·m²]."""
         return math.hypot(*self.moment_Am2)
+
+    @property
+    def relative_sigma(self) -> float:
+        """Standard deviation of the moment's modulus over this modulus."""
+        return self.moment_sigma_Am2 / self.modulus_Am2
 
     @property
     def remanence_T(self) -> float:
@@ -220,15 +226,20 @@ class MagnetBody:
         """True if some magnet is not a dipole."""
         return any(magnet.shape is not None for magnet in self.magnets)
 
+    @property
+    def common_strength_sigma(self) -> float:
+        """Standard deviation of the relative change of all moments by their common temperature."""
+        return abs(self.remanence_per_K) * self.temperature_sigma_K
+
     @cached_property
     def moment_root(self) -> FloatArray:
         """Square root (K, q) of the covariance of relative errors of the moments; q is 0 for exact moments.
 
         The first columns are those of single magnets, the last one is the temperature that all of them share.
         """
-        own = np.array([magnet.moment_sigma_Am2 / magnet.modulus_Am2 for magnet in self.magnets])
+        own = np.array([magnet.relative_sigma for magnet in self.magnets])
         columns = np.diag(own)[:, own > 0.0]
-        common = abs(self.remanence_per_K) * self.temperature_sigma_K
+        common = self.common_strength_sigma
         return np.column_stack([columns, np.full(len(own), common)]) if common else columns
 
     def without(self, index: int) -> tuple[Magnet, ...]:

@@ -20,7 +20,7 @@
     rotation_xyzw = [0, 0, 0, 1]        # optional, axes of the shape -> body; by default a cylinder or ring has its
                                         # axis along the moment, a cuboid its edges along the body's axes
     [range]                             # optional, limits of the pose in the array's frame
-    position_m = [[-0.003, 0.003], [-0.003, 0.003], [0.010, 0.014]]
+    position_m = [[-0.003, 0.003], [-0.003, 0.003], [0.010, 0.014]]  # inf and -inf: no limit
     angle_deg = 20.0                    # largest rotation from rest, where the axes of body and array agree
 """
 
@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from os import PathLike
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
@@ -108,6 +108,8 @@ class _MagnetTable(Table, kw_only=True):
 
 
 class _RangeTable(Table, kw_only=True):
+    floats_may_be_infinite: ClassVar[bool] = True
+
     position_m: tuple[tuple[float, float], tuple[float, float], tuple[float, float]] | None = None
     angle_deg: float = 180.0
 
@@ -213,7 +215,7 @@ def body_toml(body: MagnetBody) -> str:
             lines.append(f"rotation_xyzw = {toml_value(list(magnet.rotation_xyzw))}")
     if body.limits != PoseLimits():
         lines += ["", "[range]"]
-        if body.limits.is_bounded:
+        if any(map(math.isfinite, (*body.limits.low_m, *body.limits.high_m))):
             box = [list(pair) for pair in zip(body.limits.low_m, body.limits.high_m, strict=True)]
             lines.append(f"position_m = {toml_value(box)}")
         lines.append(f"angle_deg = {toml_value(math.degrees(body.limits.angle_rad))}")

@@ -86,11 +86,10 @@ class BodyPrior:
 
     def deviations(self, body: MagnetBody) -> FloatArray:
         """Return the standard deviations of the magnets' unknowns (K, 6); what the body states comes first."""
-        common = abs(body.remanence_per_K) * body.temperature_sigma_K
         rows = np.empty((len(body.magnets), PER_MAGNET))
         for row, magnet in zip(rows, body.magnets, strict=True):
             row[PLACE] = magnet.position_sigma_m or self.position_m
-            row[STRENGTH] = math.hypot(magnet.moment_sigma_Am2 / magnet.modulus_Am2, common) or self.strength
+            row[STRENGTH] = math.hypot(magnet.relative_sigma, body.common_strength_sigma) or self.strength
             row[DIRECTION] = magnet.direction_sigma_rad or self.direction_rad
         return rows
 

@@ -16,6 +16,8 @@ from arrays.io.tables import align
 from magloc.cli.calibration.sensors import (
     PriorOptions,
     calibration_files,
+    fit_entries,
+    fit_notes,
     sensor_entries,
     sensor_prior,
     sensor_table,
@@ -142,14 +144,7 @@ def _report(result: BodyCalibration, n_rows: int, out: Path | None, out_body: Pa
     return {
         "out": None if out is None else str(out),
         "out_body": None if out_body is None else str(out_body),
-        "rows": n_rows,
-        "rows_used": int(result.rows.sum()),
-        "chi2_before": result.chi2_before,
-        "dof_before": result.dof_before,
-        "chi2_after": result.chi2,
-        "dof_after": result.dof,
-        "iterations": result.iterations,
-        "converged": result.converged,
+        **fit_entries(result, n_rows),
         "sensors": sensor_entries(result),
         "magnets": magnets,
         "unobservable": unobservable_entries(result),
@@ -178,13 +173,7 @@ def _lines(result: BodyCalibration) -> list[str]:
 
 def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
     """Return notes on rows and χ², on undetermined directions, and on left-out rows."""
-    notes = [
-        f"{int(result.rows.sum())} of {n_rows} rows used; χ² {result.chi2_before:.4g} with {result.dof_before:.0f} "
-        f"degrees of freedom before, {result.chi2:.4g} with {result.dof:.0f} after"
-    ]
-    if result.unobservable:
-        names = "; ".join(direction.name for direction in result.unobservable)
-        notes.append(f"not determined by the readings, kept as in the files: {names}")
+    notes = fit_notes(result, n_rows, "the files")
     if result.cross_validation is not None:
         notes.append(_validation_note(result.cross_validation))
     if result.far_from_prior:

@@ -17,6 +17,8 @@ from magloc.cli.calibration.by_body import BodyOptions, CalibratedFiles, calibra
 from magloc.cli.calibration.sensors import (
     PriorOptions,
     calibration_files,
+    fit_entries,
+    fit_notes,
     sensor_entries,
     sensor_prior,
     sensor_table,
@@ -238,14 +240,7 @@ def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]
     constant = bool((result.moment_Am2 == result.moment_Am2[0]).all())
     return {
         "out": str(out),
-        "rows": n_rows,
-        "rows_used": int(result.rows.sum()),
-        "chi2_before": result.chi2_before,
-        "dof_before": result.dof_before,
-        "chi2_after": result.chi2,
-        "dof_after": result.dof,
-        "iterations": result.iterations,
-        "converged": result.converged,
+        **fit_entries(result, n_rows),
         "moment_Am2": result.moment_Am2[0] if constant else None,
         "sensors": sensor_entries(result),
         "unobservable": unobservable_entries(result),
@@ -269,13 +264,7 @@ def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> l
 
     from magloc.calibration.sensors import GAINS
 
-    notes = [
-        f"{int(result.rows.sum())} of {n_rows} rows used; χ² {result.chi2_before:.4g} with {result.dof_before:.0f} "
-        f"degrees of freedom before, {result.chi2:.4g} with {result.dof:.0f} after"
-    ]
-    if result.unobservable:
-        names = "; ".join(direction.name for direction in result.unobservable)
-        notes.append(f"not determined by the readings, kept as in the array file: {names}")
+    notes = fit_notes(result, n_rows, "the array file")
     far = np.max(np.abs(result.change[:, GAINS]), axis=1) > _STRANGE * prior.gain
     strangers = [sensor for sensor, strange in zip(result.array.ids, far.tolist(), strict=True) if strange]
     gains = 1.0 + result.change[:, GAINS]

@@ -86,6 +86,32 @@ def names_of(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")] if text else []
 
 
+def fit_entries(result: SourceCalibration | BodyCalibration, n_rows: int) -> dict[str, Any]:
+    """Return rows, χ² and iterations of a fit to `n_rows` rows, as ``--json`` prints them."""
+    return {
+        "rows": n_rows,
+        "rows_used": int(result.rows.sum()),
+        "chi2_before": result.chi2_before,
+        "dof_before": result.dof_before,
+        "chi2_after": result.chi2,
+        "dof_after": result.dof,
+        "iterations": result.iterations,
+        "converged": result.converged,
+    }
+
+
+def fit_notes(result: SourceCalibration | BodyCalibration, n_rows: int, nominal: str) -> list[str]:
+    """Return notes on rows and χ² of a fit to `n_rows` rows, and on the directions that stay as in `nominal`."""
+    notes = [
+        f"{int(result.rows.sum())} of {n_rows} rows used; χ² {result.chi2_before:.4g} with {result.dof_before:.0f} "
+        f"degrees of freedom before, {result.chi2:.4g} with {result.dof:.0f} after"
+    ]
+    if result.unobservable:
+        names = "; ".join(direction.name for direction in result.unobservable)
+        notes.append(f"not determined by the readings, kept as in {nominal}: {names}")
+    return notes
+
+
 def sensor_entries(result: SourceCalibration | BodyCalibration) -> list[dict[str, Any]]:
     """Return the sensors that ``--json`` prints."""
     from magloc.calibration.sensors import AXES, GAINS, OFFSET, POSITION

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from arrays.io.errors import InputError
-from magloc.bodies.body import MagnetBody
+from magloc.bodies.body import MagnetBody, PoseLimits
 from magloc.bodies.body_file import body_toml, read_body, write_body
 
 KNOB = """
@@ -58,6 +60,13 @@ def test_a_body_survives_writing_and_reading(tmp_path: Path) -> None:
     again = read_body(tmp_path / "again.toml")
     assert body_toml(again) == body_toml(body)
     np.testing.assert_allclose(again.moments_Am2, body.moments_Am2, rtol=1e-15)
+
+
+def test_limits_on_one_side_survive_writing(tmp_path: Path) -> None:
+    (tmp_path / "knob.toml").write_text(KNOB, encoding="utf-8")
+    above = PoseLimits((-math.inf, -math.inf, 0.01), (math.inf, math.inf, math.inf))
+    write_body(tmp_path / "again.toml", replace(read_body(tmp_path / "knob.toml"), limits=above))
+    assert read_body(tmp_path / "again.toml").limits == above
 
 
 @pytest.mark.parametrize(
