@@ -338,8 +338,11 @@ def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
     """Return the readings of a sensor, NaN where one of their components is missing."""
     shape = (n, 4 if name == "star" else 3)
     values = np.full(shape, np.nan) if given is None else numbers(given)
-    if values.shape != shape or np.isinf(values).any():
-        raise ValueError(f"Input {name} must have shape {shape} and no infinity; instead received {values.shape}.")
+    if values.shape != shape:
+        raise ValueError(f"Input {name} must have shape {shape}; instead received {values.shape}.")
+    infinite = values[np.isinf(values).any(axis=1)]
+    if len(infinite):
+        raise ValueError(f"Input {name} must have no infinity; instead received {infinite[0].tolist()}.")
     if name in ("star", "sun") and (values == 0.0).all(axis=1).any():
         raise ValueError(f"Input {name} must have a direction; instead received a reading of length 0.")
     return np.where(np.isnan(values).any(axis=1, keepdims=True), np.nan, values)

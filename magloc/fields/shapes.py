@@ -132,7 +132,7 @@ def shape_fields(shape: Shape, points_m: ArrayLike, moment_Am2: ArrayLike) -> Fl
     Returns
     -------
     ndarray, shape (..., 3)
-        Field [T].
+        Field [T]; NaN where a point or a moment is not finite.
 
     Raises
     ------
@@ -150,7 +150,8 @@ def shape_jacobians(
     Parameters and errors are those of :func:`shape_fields`. Both Jacobians are symmetric and traceless.
     """
     field, by_point, by_moment = fields_or_nan(shape, points_m, moment_Am2)
-    inside = np.isnan(field).any(axis=-1) & np.isfinite(np.broadcast_to(points_m, field.shape)).all(axis=-1)
+    given = np.isfinite(np.broadcast_to(points_m, field.shape)) & np.isfinite(np.broadcast_to(moment_Am2, field.shape))
+    inside = np.isnan(field).any(axis=-1) & given.all(axis=-1)
     if inside.any():
         point = np.broadcast_to(points_m, field.shape)[inside][0].tolist()
         raise ValueError(

@@ -225,6 +225,9 @@ class TestInside:
         with pytest.raises(ValueError, match=f"inside a {shape.kind} of size_m"):
             shape_fields(shape, [outside, inside], MOMENTS[2])
 
+    def test_a_moment_that_is_nan_is_not_inside(self) -> None:
+        assert np.isnan(shape_fields(SHAPES[3], [[0.0, 0.0, 2.0]], [0.0, np.nan, 1.0])).all()
+
     def test_hole_of_a_ring_by_magpylib(self) -> None:
         shape = Shape("ring", (0.5, 1.0, 0.4))
         rng = np.random.default_rng(11)
