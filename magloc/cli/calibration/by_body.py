@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _POSITION_MM = 0.5
 _EXCESS = 3.0  # χ²/dof: 1.7 times the stated noise
+_CHECK = "Check the noise of the array file, and the positions, the order qx, qy, qz, qw and the errors of --truth"
 
 
 @Parameter(name="*", group="Body of several magnets")
@@ -122,7 +123,8 @@ def _check(result: BodyCalibration, readings: Path) -> None:
     if not result.converged:
         raise InputError(
             f"{readings}: the calibration did not converge within {result.iterations} iterations "
-            f"(χ² {result.chi2:.4g}), expected readings that fit the files and their priors; nothing is written."
+            f"(χ² {result.chi2:.4g}), expected readings that fit the files and their priors; nothing is written. "
+            f"{_CHECK}."
         )
 
 
@@ -182,8 +184,8 @@ def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
     excess = result.chi2 / max(1.0, result.dof)
     if excess > _EXCESS:
         notes.append(
-            f"warning: χ² is {excess:.2g} times its degrees of freedom, expected about 1; do not use this calibration."
-            " Check the noise of the array file, and the positions, the order qx, qy, qz, qw and the errors of --truth"
+            f"warning: χ² is {excess:.2g} times its degrees of freedom, expected about 1; do not use this calibration. "
+            f"{_CHECK}"
         )
     return notes
 

@@ -115,11 +115,12 @@ class TestRefusals:
         monkeypatch.chdir(folder)
         assert_refused(run("calibrate", "readings.csv", "--array", "array.toml", *words), expected)
 
-    def test_a_quaternion_in_the_wrong_order_is_warned_of(self, run: Run, options: list[str], tmp_path: Path) -> None:
+    def test_a_quaternion_in_the_wrong_order_is_refused(self, run: Run, options: list[str], tmp_path: Path) -> None:
         lines = Path(options[6]).read_text(encoding="utf-8").splitlines()
         swapped = [line.split(",") for line in lines]
         text = [",".join([*c[:4], c[7], *c[4:7], *c[8:]]) if i else lines[0] for i, c in enumerate(swapped)]
         (tmp_path / "wxyz.csv").write_text("\n".join(text) + "\n", encoding="utf-8")
         options[6] = str(tmp_path / "wxyz.csv")
         done = run("calibrate", *options)
-        assert done.status == 2 or "the order qx, qy, qz, qw" in done.err
+        assert done.status == 2
+        assert "the order qx, qy, qz, qw" in done.err
