@@ -237,7 +237,7 @@ def calibrate_log(
 def _usable(series: Series, log: VehicleLog) -> tuple[Series, list[str]]:
     """Return a magnetometer's readings without those that are stuck, and sentences on what is missing."""
     known = series.finite()
-    stuck = known.stuck_parts()
+    stuck = known.stuck_parts() if len(known.values) else []
     rest = known.outside(stuck)
     if not len(rest.values):
         return known, []

@@ -15,6 +15,7 @@ SHORTEST_S, FEWEST_ROWS = 2.0, 10
 _KNOT_S, _MOST_KNOTS = 2.0, 1500
 _LONGEST_GAP_S = 0.25
 _STUCK_S, _STUCK_ROWS = 5.0, 20
+_MOVED = 0.05  # of the field: change of the other axes that noise or coarse steps do not make
 _SILENT_S = 5.0
 
 
@@ -44,12 +45,24 @@ class Series:
         return max(float(np.ptp(self.values)), 1e-6)
 
     def stuck_parts(self) -> list[tuple[float, float]]:
-        """Return the times in which all readings are equal for longer than a sensor's noise allows."""
-        new = np.concatenate([[True], (np.diff(self.values, axis=0) != 0.0).any(axis=1)])
+        """Return the times in which readings (n, 3), or one axis while the others move, are equal for too long."""
+        least = _MOVED * float(np.median(np.linalg.norm(self.values, axis=1)))
+        runs = self._equal_runs(self.values)
+        for axis in range(3):
+            others = np.delete(self.values, axis, axis=1)
+            moved = (
+                run for run in self._equal_runs(self.values[:, [axis]]) if np.ptp(others[run], axis=0).max() > least
+            )
+            runs += moved
+        return [(float(self.time_s[run.start]), float(self.time_s[run.stop - 1])) for run in runs]
+
+    def _equal_runs(self, values: FloatArray) -> list[slice]:
+        """Return the rows of equal values (n, k) that last longer than a sensor's noise allows."""
+        new = np.concatenate([[True], (np.diff(values, axis=0) != 0.0).any(axis=1)])
         begin = np.flatnonzero(new)
         end = np.append(begin[1:], len(new)) - 1
         long = (end - begin >= _STUCK_ROWS) & (self.time_s[end] - self.time_s[begin] > _STUCK_S)
-        return [(float(self.time_s[a]), float(self.time_s[b])) for a, b in zip(begin[long], end[long], strict=True)]
+        return [slice(int(first), int(last) + 1) for first, last in zip(begin[long], end[long], strict=True)]
 
     def silent_parts(self, first_s: float, last_s: float) -> list[tuple[float, float]]:
         """Return the times between two instants in which there are no readings for long."""

@@ -207,6 +207,18 @@ class TestFaults:
         error, covariance = parameter_errors(flight, found)
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
 
+    @pytest.mark.parametrize("axis", range(3))
+    def test_axis_that_stands(self, axis):
+        """One axis of a sensor stands while the others move: the sensor is left out from then on, and named."""
+        flight = simulate_flight(9, SHORT)
+        mag = flight.log.magnetometers[0]
+        values = mag.values.copy()
+        values[mag.time_s > 40.0, axis] = values[mag.time_s <= 40.0, axis][-1]
+        found = adcs.calibrate_log(replace(flight.log, magnetometers=(replace(mag, values=values),)), field_T=FIELD_T)
+        assert any("mag0 stands at one value from 40.0" in flag for flag in found.flags)
+        error, covariance = parameter_errors(flight, found)
+        assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
+
     def test_log_without_currents(self):
         flight = simulate_flight(1, replace(SHORT, duration_s=30.0))
         found = adcs.calibrate_log(replace(flight.log, currents=()), field_T=FIELD_T)
