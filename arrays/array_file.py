@@ -41,7 +41,7 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     noise_nT = 1.0
 
 Both may have ``noise_fraction``, ``common_field_nT`` or, in its place, ``background = "subtracted"`` (a background was
-taken out of the readings: :data:`BACKGROUND_CHANGE_T`), ``ambient_nT = [x, y, z]`` or ``ambient_world_nT``, the
+subtracted from the readings: :data:`BACKGROUND_CHANGE_T`), ``ambient_nT = [x, y, z]`` or ``ambient_world_nT``, the
 gradient of that field ``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless),
 ``ambient_uncertainty_nT``, ``ambient_uncertainty_white_nT``, ``format_version = 1``, and the tables ``[pose]`` and
 ``[columns]``; see :class:`arrays.array.SensorArray` for what they mean.

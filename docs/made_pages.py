@@ -27,7 +27,7 @@ ORIGINALS = "../../../notebooks"
 PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
 # A link of a command's page to a heading that is on another page now.
 LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
-# Modules whose names have a list of their own, in alphabetical order.
+# Modules whose names have a separate list, in alphabetical order.
 MODULES = ("magloc.live", "magloc.plots", "adcs.mockup", "sims.experiments")
 # Other pages that a function's page names at most of each folder, in this order.
 MOST_PAGES = {"guide": 3, "theory": 2, "gallery": 2}

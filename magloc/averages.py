@@ -17,7 +17,7 @@ def average(readings: Readings) -> Readings:
     """Return the average of all complete rows of an array at rest, at the mean time.
 
     A row is complete if it has every channel that any row has. A channel that no row has stays missing. Incomplete
-    rows are left out: the field common to all sensors changes from row to row, and it cancels only between channels
+    rows are ignored: the field common to all sensors changes from row to row, and it cancels only between channels
     that are averaged over the same rows. Raises InputError if the array moves, the ambient field changes or no row is
     complete.
     """

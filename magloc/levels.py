@@ -41,7 +41,7 @@ CREDIBLE_ROW = 0.999
 """Quantile of χ² up to which a row counts as free of bad sensors. Rows above it are examined, which costs little."""
 
 SENSOR_FALSE_ALARM = 1e-3
-"""Share of rows in which a good sensor is left out; it is divided among all sensors of the array."""
+"""Share of rows in which a good sensor is excluded; it is divided among all sensors of the array."""
 
 SUSPICIOUS_FIT = 0.99
 """Quantile of χ² of K sources above which another source is tried. A later test decides if it is kept."""

@@ -14,5 +14,5 @@ def refuse_foreign_packages() -> None:
         if os.path.dirname(os.path.dirname(os.path.realpath(path))) != _HERE:
             raise ImportError(
                 f"magloc found the package {name} {f'at {path}' if path else 'nowhere'}, expected its own in {_HERE}:"
-                " another distribution has installed that name. Install magloc into an environment of its own."
+                " another distribution has installed that name. Install magloc into a separate environment."
             )

@@ -237,7 +237,7 @@ def cause_of_disagreement(truth: Truth, time_s: FloatArray, position_m: FloatArr
 
 
 def _by_length(found: FloatArray, true: FloatArray) -> tuple[float, str]:
-    """Return the error that is left by the best unit of length, and its sentence."""
+    """Return the error that remains with the best unit of length, and its sentence."""
     errors = {factor: float(np.median(np.linalg.norm(found - true / factor, axis=1))) for factor in _LENGTHS}
     factor = min(errors, key=lambda each: errors[each])
     return errors[factor], f"they are taken for {_LENGTHS[factor]}: state them in metres"
@@ -246,7 +246,7 @@ def _by_length(found: FloatArray, true: FloatArray) -> tuple[float, str]:
 def _by_clock(
     found: FloatArray, wanted_s: FloatArray, times_s: FloatArray, path: Callable[[FloatArray], FloatArray]
 ) -> tuple[float, str]:
-    """Return the error that is left by the best lag of the clock, and its sentence."""
+    """Return the error that remains with the best lag of the clock, and its sentence."""
     longest = _LONGEST_LAG * (times_s[-1] - times_s[0])
 
     def error(lag_s: float) -> float:
@@ -262,7 +262,7 @@ def _by_clock(
 
 
 def _by_frame(found: FloatArray, true: FloatArray) -> Iterator[tuple[float, str]]:
-    """Yield the errors that are left by a shift, a turn and a mirror image, each with its sentence."""
+    """Yield the errors that remain with a shift, a turn and a mirror image, each with its sentence."""
     shift = np.median(found - true, axis=0)
     moved = float(np.median(np.linalg.norm(found - true - shift, axis=1)))
     yield moved, f"they are shifted by ({shift[0]:.3g}, {shift[1]:.3g}, {shift[2]:.3g}) m: its origin is another"

@@ -10,7 +10,7 @@ import pytest
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
-    """Give the notebook's kernel an environment of its own; it inherits this process's."""
+    """Give the notebook's kernel a separate environment; it inherits this process's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONWARNINGS", "error")
         patch.setenv("JUPYTER_PLATFORM_DIRS", "1")

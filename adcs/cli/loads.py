@@ -107,7 +107,7 @@ def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
     import numpy as np
 
     noise = ", ".join(f"{name} {1e9 * one:.3g}" for name, one in zip(own.array.ids, own.noise_T, strict=True))
-    lag = f"{own.lag.rows:g} rows, {own.lag.seconds:.3g} s" if own.lag.is_known else "not told by these switches"
+    lag = f"{own.lag.rows:g} rows, {own.lag.seconds:.3g} s" if own.lag.is_known else "not determined by these switches"
     text = [
         f"noise of the residuals [nT]: {noise}; χ² / numbers (1 if noise is as stated): {own.chi2_per_dof:.3g}",
         f"readings later than states by: {lag}",

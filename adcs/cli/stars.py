@@ -251,7 +251,7 @@ def _frames(
     if noise_px > most_px:
         raise InputError(
             f"--noise-px: found {noise_px:g}, expected at most {most_px:g}, a tenth of the image's shorter side: "
-            "beyond it, stars cannot be told apart."
+            "beyond it, stars cannot be distinguished."
         )
     if rad_per_px is not None:
         with naming("--scale-arcsec"):

@@ -171,7 +171,7 @@ class AttitudeEstimate:
 
     @property
     def disturbed(self) -> bool:
-        """True if the field is left out, or a magnet is subtracted."""
+        """True if the field is ignored, or a magnet is subtracted."""
         return bool(self.bits & 6)
 
 

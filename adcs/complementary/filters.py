@@ -173,7 +173,7 @@ def inertial_magnetic_filter(
     -------
     AttitudeTrack
         Attitude, east, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: σ of the tilt
-        in the first two, of the heading in the third. ``degraded`` marks the rows in which the field is left out, a
+        in the first two, of the heading in the third. ``degraded`` marks the rows in which the field is ignored, a
         magnet is subtracted, or the heading is lost or doubtful. ``warnings`` name gaps, a start that is not at rest, a
         missing magnetometer, and minutes in which the gyro alone holds the heading.
 
@@ -320,7 +320,7 @@ def _gyro_only_minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ..
     minutes, which = np.unique((time_s[left_out] - time_s[0]) // 60.0, return_inverse=True)
     seconds = np.bincount(which, weights=steps_s(time_s)[left_out], minlength=len(minutes))
     return tuple(
-        f"minute {minute + 1:.0f}: the field was left out for {lasted:.0f} s, the gyro alone held the heading"
+        f"minute {minute + 1:.0f}: the field was ignored for {lasted:.0f} s, the gyro alone held the heading"
         for minute, lasted in zip(minutes, seconds, strict=True)
         if lasted >= 1.0
     )

@@ -284,7 +284,7 @@ class Sgp4Orbit:
             first = int(np.flatnonzero(errors)[0])
             raise ValueError(
                 f"Input utc must be instants that SGP4 reaches; instead received {np.ravel(utc)[first]}: "
-                + ("the satellite has decayed by then." if errors[first] == _DECAYED else "no orbit is left by then.")
+                + ("the satellite has decayed by then." if errors[first] == _DECAYED else "no orbit remains by then.")
             )
         shape = (*np.shape(utc), 3)
         return 1e3 * position.reshape(shape), 1e3 * velocity.reshape(shape)

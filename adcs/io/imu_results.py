@@ -62,7 +62,7 @@ def summary_words(summary: dict[str, Any]) -> list[str]:
     """Return the totals as text."""
     used = {
         "plain": "the field was used as it is",
-        "reject": "the field was left out where it contradicts",
+        "reject": "the field was ignored where it contradicts",
         "subtract": "a magnet that moves with the sensor was subtracted",
         "six-axes": "there is no field: the heading is relative to the first row",
     }

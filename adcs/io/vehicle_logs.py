@@ -98,7 +98,7 @@ def read_vehicle(
         dead = [one.name for one in log.magnetometers if not _varies(one)]
         if not alive:
             return VehicleFile(log)
-        warnings = tuple(f"{name} has no readings that vary, and is left out" for name in dead)
+        warnings = tuple(f"{name} has no readings that vary, and is ignored" for name in dead)
         return VehicleFile(replace(log, magnetometers=alive), warnings=warnings)
     if layout is not None:
         raise InputError(f"{path}: found a binary log with a layout (--config), expected a CSV file, or no layout.")

@@ -40,7 +40,7 @@ def tuned_noise(used: SensorSet, inertia_kgm2: ArrayLike | None = None) -> Proce
             return ProcessNoise(1e-8, scale * 1e-8, disturbance_s2=scale * 3e-10)
         return ProcessNoise(1e-8, scale * 2e-7)
     if "disturbance" in used.states:
-        # The torque is a state, so the rate needs almost no noise of its own.
+        # The torque is a state, so the rate itself needs almost no noise.
         if used.star and "gyro-bias" not in used.states:
             return ProcessNoise(1e-8, scale * 1e-8, disturbance_s2=scale * 3e-8)
         return ProcessNoise(1e-8, scale * 1e-7, disturbance_s2=scale * 1e-8)

@@ -392,7 +392,7 @@ class _Row:
     star_covariance_rad2: FloatArray
 
     def join(self, late: _Row) -> _Row:
-        """Return the row with late readings of the same time in place of its own."""
+        """Return the row with its readings replaced by late ones of the same time."""
         readings = {name: _latest(values, self.readings[name]) for name, values in late.readings.items()}
         has_star = not np.isnan(late.readings["star"]).any()
         return _Row(self.time_s, readings, (late if has_star else self).star_covariance_rad2)

@@ -176,7 +176,7 @@ def calibrate_log(
     The attitude is that of the gyro, whose bias, scales and axes are estimated; the accelerometer holds the tilt, and
     accelerations of the vehicle are unknown. The magnetometers turn in a field that is constant in the world. Their
     noise, slow errors and the random walk of the attitude are those of the largest likelihood. Parts of the log that
-    fit none of it are left out and flagged.
+    fit none of it are excluded and flagged.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def _usable(series: Series, log: VehicleLog) -> tuple[Series, list[str]]:
     rest = known.outside(stuck)
     if not len(rest.values):
         return known, []
-    words = "{} stands at one value from {:.1f} to {:.1f} s; these readings are left out"
+    words = "{} keeps one value from {:.1f} to {:.1f} s; these readings are ignored"
     sentences = [words.format(series.name, *part) for part in stuck]
     silent = known.silent_parts(float(log.time_s[0]), float(log.time_s[-1]))
     return rest, sentences + [f"{series.name} has no readings from {a:.1f} to {b:.1f} s" for a, b in silent]
@@ -287,9 +287,9 @@ def _flags(fit: LogFit, terms: Terms) -> Iterator[str]:
         parts = _parts(fit.disturbed[m])
         for begin, end in parts[:3]:
             at = data.time_s[data.knots[[begin, end]]]
-            yield f"{name} is disturbed from {at[0]:.1f} to {at[1]:.1f} s, as by a magnet nearby; this part is left out"
+            yield f"{name} is disturbed from {at[0]:.1f} to {at[1]:.1f} s, as by a magnet nearby; this part is ignored"
         if len(parts) > 3:
-            yield f"{name} is disturbed in {len(parts) - 3} further parts of the log, which are left out"
+            yield f"{name} is disturbed in {len(parts) - 3} further parts of the log, which are ignored"
     if data.in_gap.any():
         yield f"gyro or accelerometer have gaps within {data.span_s[data.in_gap].sum():.0f} s of the log"
     if not estimate.problem.currents:

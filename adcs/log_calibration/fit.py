@@ -66,7 +66,7 @@ class LogFit:
     mountings : ndarray, shape (M, 3, 3)
         Rotation around which each magnetometer's matrix has its prior.
     disturbed : tuple of ndarray of bool, shape (K - 1,)
-        Intervals of each magnetometer that are left out.
+        Intervals of each magnetometer that are excluded.
     converged : bool
     """
 

@@ -13,7 +13,7 @@ _MOST_POINTS = 4000
 
 
 def log_calibration_figure(found: LogCalibration) -> Figure:
-    """Draw the modulus of each magnetometer before and after its calibration; shades are left out.
+    """Draw the modulus of each magnetometer before and after its calibration; shades are excluded parts.
 
     Without any error the modulus is that of the Earth's field, the dashed line.
     """

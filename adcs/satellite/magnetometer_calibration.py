@@ -37,7 +37,7 @@ NAMES = (
 )
 """Parameters of the calibration, in the order of its covariance."""
 OUTLIER = 5.0
-"""Rows with residuals beyond this times their spread are left out."""
+"""Rows with residuals beyond this times their spread are excluded."""
 _ITERATIONS, _ROUNDS, _DECIMATED, _SETTLED, _FEWEST = 60, 10, 1000, 1e-4, 20
 _KNOT_S, _SHIFTS_S = 10.0, 15.0
 """Steps of the model's instants and of the trial shifts; the field changes over minutes."""
@@ -284,7 +284,7 @@ def calibrate_readings(
 
 
 def _check_enough(used: BoolArray) -> None:
-    """Raise ValueError if too few rows are left."""
+    """Raise ValueError if too few rows remain."""
     if used.sum() < _FEWEST:
         raise ValueError(
             f"Input telemetry must have {_FEWEST} rows of the magnetometer that fit each other; "

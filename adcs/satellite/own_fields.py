@@ -11,7 +11,7 @@ gain and axes as the readings, so it can be subtracted from them. A dipole fit t
 the load.
 
 States and readings may have different clocks. The lag in whole rows is the one for which the switches explain the jumps
-between rows best. Rows beside the switches that fit neither state are then left out.
+between rows best. Rows beside the switches that fit neither state are then excluded.
 """
 
 from __future__ import annotations

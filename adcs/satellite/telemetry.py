@@ -116,7 +116,7 @@ def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> R
 
 
 def instants_as_runs(record: Record, run: int) -> Record:
-    """Return each instant of a run as a run of its own."""
+    """Return each instant of a run as a separate run."""
     return _take(record, record.environment.time_s[:1], lambda values: values[run][:, None])
 
 

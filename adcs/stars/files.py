@@ -81,7 +81,7 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
     outside = (hip < 0.0) | (hip > _LARGEST_NUMBER)
     if outside.any():
         found = f"found {hip[np.argmax(outside)]:.15g}, expected a number from 0 to {_LARGEST_NUMBER}"
-        table.refuse(outside[:, None], COLUMNS, f"{found} ({NO_STAR} stands for no star)")
+        table.refuse(outside[:, None], COLUMNS, f"{found} ({NO_STAR} means no star)")
     table.refuse(np.abs(values[:, 2:3]) > 90.0, COLUMNS[2:], "found a declination beyond 90°, expected -90 to 90")
     table.refuse(np.abs(values[:, 1:2]) > 360.0, COLUMNS[1:], "found more than a turn, expected 0 to 360")
     try:

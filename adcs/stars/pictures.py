@@ -148,7 +148,7 @@ def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> P
     the centroid, in a window of 7 pixels.
 
     ``picture``, ``dark`` (height, width): the dark picture is subtracted. Pixels that are NaN are masked. A light
-    with a masked pixel among its middle 25 is left out. The brightest light comes first.
+    with a masked pixel among its middle 25 is rejected. The brightest light comes first.
     """
     values = picture if dark is None else picture - dark
     masked = ~np.isfinite(values)

@@ -30,7 +30,7 @@ _FRAMES_PER_SECOND = 15.0
 
 
 class LiveAttitudeView(View):
-    """Page of an attitude, which a thread of its own draws, so that no row waits for the page.
+    """Page of an attitude, drawn by a separate thread, so that no row waits for the page.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def disturbance_lines(estimate: AttitudeEstimate) -> list[str]:
     """Return the use of the magnetometer and all flags as lines of HTML."""
     lines = []
     if "field-left-out" in estimate.flags:
-        lines.append("the field is left out")
+        lines.append("the field is ignored")
     if "magnet-subtracted" in estimate.flags:
         lines.append(f"a magnet of {1e6 * float(np.linalg.norm(estimate.offset_T)):.3g} µT is subtracted")
     others = [flag for flag in estimate.flags if flag not in ("field-left-out", "magnet-subtracted")]

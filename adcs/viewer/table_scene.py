@@ -163,7 +163,7 @@ class TableScene:
         return np.column_stack([closed, np.full(len(closed), CEILING_M)])
 
     def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> viser.FrameHandle:
-        """Add a ring with an arrow in a frame of their own."""
+        """Add a ring with an arrow in a separate frame."""
         frame = self._scene.add_frame(name, show_axes=False, visible=False)
         tip = np.array([_ARROW_M, 0.0, 0.0])
         barbs = [tip + np.array([-0.06, side * 0.045, 0.0]) for side in (1.0, -1.0)]

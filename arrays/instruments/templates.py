@@ -10,7 +10,7 @@ addition:
   header has its columns, with ``every_sensor = true`` those of all sensors, and a line matches the pattern ``row``.
 
 In the table ``columns`` a name may have alternatives, ``"Alt|Altitude"``. Sensors and optional columns (``valid``,
-``fix``, ``line``, attitude) that a log does not have are left out.
+``fix``, ``line``, attitude) that a log does not have are omitted.
 """
 
 from __future__ import annotations

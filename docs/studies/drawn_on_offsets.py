@@ -1,6 +1,6 @@
 """Tracks on unknown offsets of sources that move as is stated: ``python -m docs.studies.drawn_on_offsets walk``.
 
-Truths are drawn from the motion that the tracker is told, 250 A·m² from 8 m on. Prints NEES per dimension of every
+Truths are drawn from the motion that the tracker assumes, 250 A·m² from 8 m on. Prints NEES per dimension of every
 track, and what it says of itself.
 """
 

@@ -64,7 +64,7 @@ def main() -> None:
         runs.append(judged(points, truth, row_ms))
         run = runs[-1]
         print(
-            f"seed {seed}: swaps {run.swaps} ({run.early_swaps} since first told), rows with too many"
+            f"seed {seed}: swaps {run.swaps} ({run.early_swaps} since first reported), rows with too many"
             f" {run.false_births},"
             f" too few {run.lost_rows}, misfit"
             f" {run.misfit_rows}, merged {run.merged_rows}, birth after {run.late_birth_rows}, loss after"
@@ -78,7 +78,7 @@ def main() -> None:
     nees = np.array([run.nees for run in runs])
     print(
         f"{len(runs)} runs: {sum(run.swaps > 0 for run in runs)} with a swap"
-        f" ({sum(run.early_swaps > 0 for run in runs)} since first told),"
+        f" ({sum(run.early_swaps > 0 for run in runs)} since first reported),"
         f" {sum(run.false_births > 0 for run in runs)} with a false birth, {np.sum(nees > 3.0)} broken (NEES above 3);"
         f" NEES of the median run {np.median(nees):.2f};"
         f" {np.median([np.median(run.row_ms) for run in runs]):.2f} ms a row,"

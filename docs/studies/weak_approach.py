@@ -2,7 +2,7 @@
 
 A tetrahedron of 1.5 m, 0.2 nT, 2 Hz. The source starts 20 m away in any direction, with a moment in any direction that
 is 4 to 6 standard deviations strong in the first row, and passes by at 5 m in the last one, at constant velocity; its
-moment turns at a rate of 1.2°/s about each axis. The tracker is told the motion, not that the source comes nearer.
+moment turns at a rate of 1.2°/s about each axis. The tracker knows the motion, but not that the source comes nearer.
 
 Prints of rows what errors, range sets and weights are against what they claim.
 """

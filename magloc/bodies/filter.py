@@ -172,7 +172,7 @@ class _State:
     is_new: bool = False
 
     def copy(self) -> _State:
-        """Return a state of its own memory."""
+        """Return a state with memory that it does not share."""
         arrays = (self.pose.copy(), self.rates.copy(), self.errors.copy(), self.covariance.copy())
         return _State(*arrays, self.progress.copy(), self.is_new)
 

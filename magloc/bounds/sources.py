@@ -59,7 +59,7 @@ def array_model(
     nuisances = np.flatnonzero(deviations)
     errors = [(s.misalignment_rad, s.induced_uncertainty, s.gain_uncertainty) for s in array.sensors]
     misalignment, induced, gain_error = np.array(errors).T
-    # A modulus is read along an axis of its own.
+    # Each modulus is read along a separate axis.
     rotation = np.where(is_modulus[:, None, None], np.eye(3), array.rotation_matrices)[array.channel_sensor]
     scale = gain_error[array.channel_sensor, None] * np.einsum("ci,cik->ck", array.channel_gain, rotation)
     return core.problem(

@@ -1,6 +1,6 @@
-"""Cross-validation of a calibration on a known path: rows left out are located with the calibration of the others.
+"""Cross-validation of a calibration on a known path: rows held out are located with the calibration of the others.
 
-Blocks of successive rows are left out, because neighbouring rows are nearly one pose.
+Blocks of successive rows are held out, because neighbouring rows are nearly one pose.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _BETTER = 0.9
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Errors of rows that were left out of a calibration.
+    """Errors of rows that were held out of a calibration.
 
     Attributes
     ----------
@@ -99,9 +99,9 @@ def choose_common_field(
     moment: Literal["constant", "free"] | None = None,
     prior: CalibrationPrior = CalibrationPrior(),
 ) -> tuple[SensorArray, CrossValidation | None]:
-    """Return the array with the prior of the common field that locates left-out rows better, and their errors.
+    """Return the array with the prior of the common field that locates held-out rows better, and their errors.
 
-    The offsets of an array at rest contain the background. What is left of the common field is then small, as after a
+    The offsets of an array at rest contain the background. The rest of the common field is then small, as after a
     background was subtracted. This is decided where the array states no common field and offsets are estimated.
     """
     plain = leave_poses_out(array, readings, truth, moment=moment, prior=prior)

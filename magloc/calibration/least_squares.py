@@ -61,7 +61,7 @@ def eliminate_rows(
     n_sensors = problem.array.n_sensors
     weight, deviation = row_prior
     size = np.sqrt(np.einsum("tcn,tcn->tn", linear.by_row, linear.by_row) + weight**2)
-    # An unknown without information keeps a column of its own, so that it does not change.
+    # An unknown without information keeps a separate column, so that it does not change.
     damped = np.sqrt(damping) * np.where(size > 0.0, size, 1.0)[..., None] * np.eye(n)
     stacked = np.concatenate([linear.by_row, weight[..., None] * np.eye(n), damped], axis=1)
     q, r = np.linalg.qr(stacked)

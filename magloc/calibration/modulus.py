@@ -89,7 +89,7 @@ class EllipsoidCalibration:
 
 @dataclass(frozen=True, eq=False)
 class _EllipsoidProblem:
-    """Readings and moduli in units of their own size, so that P is about 1."""
+    """Readings and moduli divided by their typical size, so that P is about 1."""
 
     readings: FloatArray
     modulus: FloatArray
@@ -128,7 +128,7 @@ class _EllipsoidIterate:
 def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> EllipsoidCalibration:
     """Calibrate a vector sensor that was turned in a field of known modulus.
 
-    ``readings_T`` (n, 3): raw readings [T]; rows with a NaN are left out. ``modulus_T`` () or (n,): modulus of
+    ``readings_T`` (n, 3): raw readings [T]; rows with a NaN are ignored. ``modulus_T`` () or (n,): modulus of
     the field in every row [T]. ``noise_T``: standard deviation of the readings per axis [T].
     Not converged where there are fewer than nine complete readings, or where they do not determine all nine
     parameters: readings in one plane, in one small cap or along a few directions. Raises ValueError: the shapes do not

@@ -142,7 +142,7 @@ def bounds(
     out : Path
         Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID, with the moment if one is given.
     json : bool
-        Print one JSON object: "position_m", "moment_Am2", "range_m"; "body_length_m", which is left out for a point
+        Print one JSON object: "position_m", "moment_Am2", "range_m"; "body_length_m", which is omitted for a point
         source; "rank" of the information, 6 if everything is estimable; "sigma_position_m", "sigma_moment_Am2" (three
         numbers), "sigma_range_m", "sigma_bearing_deg" (null: infinite); "over_moments": "sigma_range_m" and
         "sigma_bearing_deg" with "mean", "median", "q95", "worst_sampled" for the same position; "accuracy_m";
@@ -285,7 +285,7 @@ def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> Matched
     try:
         return magloc.MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), rng=seed)
     except ValueError as error:
-        note(f"the detection range is left out: {own_sentence(error)}", always=True)
+        note(f"no detection range: {own_sentence(error)}", always=True)
         return None
 
 

@@ -61,7 +61,7 @@ def run_program(program: str) -> int:
     try:
         status = importlib.import_module(f"{program}.cli.app").main()
         for number in numbers:
-            signal.signal(number, signal.SIG_DFL)  # only the end of the interpreter is left
+            signal.signal(number, signal.SIG_DFL)  # only the interpreter's shutdown remains
     except (Exception, KeyboardInterrupt) as error:  # an interruption while an extension loads is an ImportError
         if not received and isinstance(error, Exception):
             raise

@@ -75,7 +75,7 @@ class PathOptions(MotionOptions):
         several times for several sources.
     object_path : Path
         Path file (CSV) of the source: time_s,x_m,y_m,z_m and optionally its attitude qx,qy,qz,qw, in the frame of the
-        results. Only the moment is estimated; it turns with the attitude. Rows outside the path are left out.
+        results. Only the moment is estimated; it turns with the attitude. Rows outside the path are ignored.
     error : PathErrorOptions
         Errors of a known path.
     magnet : MagnetOptions
@@ -357,7 +357,7 @@ def _write_sources(found: SourcesTrack, name: str, outputs: TrackOutputs, *, sin
 def _note_dropped(names: Iterable[str]) -> None:
     """Print the sensors that some rows do not use."""
     if names := sorted(names):
-        note(f"sensors left out of some rows: {', '.join(names)}")
+        note(f"sensors excluded from some rows: {', '.join(names)}")
 
 
 def _is_undetermined(found: Iterable[TrackPoint]) -> bool:

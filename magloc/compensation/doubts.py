@@ -41,7 +41,7 @@ def log_doubts(log: PlatformLog) -> Iterator[str]:
     for name, (stuck, wild) in log.left_out.items():
         for count, what in ((stuck, "stuck"), (wild, "wild")):
             if count:
-                yield f"{what}: {count} of {len(log.readings)} readings of sensor {name} are {what} and are left out"
+                yield f"{what}: {count} of {len(log.readings)} readings of sensor {name} are {what} and are ignored"
     yield from _axes_doubts(log)
 
 

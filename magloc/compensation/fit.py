@@ -123,7 +123,7 @@ class PlatformFit:
     problem : LinearProblem
         The last linear problem.
     outliers : int
-        Samples that were left out.
+        Samples that were excluded.
     """
 
     terms: PlatformTerms
@@ -236,7 +236,7 @@ class LinearProblem:
 
     @classmethod
     def at(cls, rows: CalibrationRows, terms: PlatformTerms, coefficients: FloatArray, lag_s: float) -> LinearProblem:
-        """Return the problem at coefficients and a lag; samples without an attitude are left out."""
+        """Return the problem at coefficients and a lag; samples without an attitude are ignored."""
         attitude = rows.attitude
         if rows.is_own and coefficients.any():
             attitude = attitude.without(terms, coefficients, rows.currents)

@@ -83,7 +83,7 @@ class SourcesScenario:
     half_width_m : float
         The cube reaches from -half_width to +half_width along every axis, around the array's centroid.
     nearest_m, farthest_m : float
-        Sources nearer to the centroid, or farther from it, are left out.
+        Sources nearer to the centroid, or farther from it, are not drawn.
     moment_Am2 : float
         Size of every source's moment.
     known_moment_sigma_Am2 : float
@@ -395,7 +395,7 @@ def source_map(
     n : int
         Sources along every axis, at least 2.
     nearest_m, farthest_m : float
-        Sources nearer to the centroid, or farther from it, are left out [m].
+        Sources nearer to the centroid, or farther from it, are not drawn [m].
     rng : int or numpy.random.Generator
         Seed or generator of the moments' directions and all errors.
     known_moment_sigma_Am2 : float

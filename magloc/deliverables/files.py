@@ -41,7 +41,7 @@ def survey_files(
 ) -> Iterator[tuple[str, Any]]:
     """Yield names and contents of the files of a survey, as :func:`arrays.io.outputs.write_files` takes them.
 
-    Without the extra ``gis`` the GeoPackage and GeoTIFF are left out, and without a browser the report as PDF. A note
+    Without the extra ``gis`` the GeoPackage and GeoTIFF are not written; without a browser the PDF is not. A note
     is logged then. Surveys of a single line have no GeoTIFF. The report shows the figures: maps, and profiles.
     """
     yield "targets.geojson", json.dumps(found.to_geojson(frame.origin)) + "\n"

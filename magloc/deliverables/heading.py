@@ -12,7 +12,7 @@ from arrays.typing import FloatArray
 from magloc.measurement.plausibility import robust_sigma
 from magloc.navigation.flight_lines import FlightLine
 
-_ENDS = 0.15  # share of a line at either end that is left out: turns
+_ENDS = 0.15  # share of a line at either end that is excluded: turns
 _STRAIGHT = 0.95  # least distance between the ends over the way
 _FEWEST = 3  # lines with two neighbours on either side
 _SEEN = 0.2  # least size of a direction of courses relative to the largest

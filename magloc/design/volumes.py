@@ -216,7 +216,7 @@ def read_surface(path: str | PathLike[str]) -> MeshSurface:
         from trimesh import load_mesh
     try:
         mesh = load_mesh(str(path), process=True)
-    except Exception as error:  # every reader has errors of its own
+    except Exception as error:  # every reader raises different errors
         raise InputError(f"{path}: found no mesh ({str(error).rstrip('.')}), expected {expected}.") from None
     faces = np.asarray(getattr(mesh, "faces", ()))
     if not faces.size or not np.isfinite(mesh.triangles).all() or not mesh.area > 0.0:

@@ -66,7 +66,7 @@ class LivePoint(TrackPoint):
     tally : Tally
         Counts of the whole stream so far.
     sources : SourcesPoint, optional
-        States of several sources, or of a body, if they are tracked. The point itself then has no state of its own,
+        States of several sources, or of a body, if they are tracked. The point itself then has no state,
         only the time, the status, the NIS and the dropped sensors.
 
     Examples

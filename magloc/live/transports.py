@@ -182,7 +182,7 @@ def _bind(address: str) -> Iterator[socket.socket]:
 class _DatagramPort:
     """Datagrams that arrive at a port, by sender. No line continues in the next datagram.
 
-    On Linux a good sender gets a socket of its own, whose buffer no flood of others fills.
+    On Linux a good sender gets a separate socket, so that a flood from others cannot fill its buffer.
     """
 
     def __init__(self, common: socket.socket, stack: ExitStack) -> None:

@@ -240,7 +240,7 @@ class TurningCalibrator:
     def _robust_fit(self, rows: FloatArray, sensor: Sensor, modulus_T: float) -> tuple[EllipsoidCalibration, BoolArray]:
         """Return the fit of the rows that agree, and those that do not.
 
-        Wild readings and rows that contradict the fit before are left out first: a magnet that comes near would bend a
+        Wild readings and rows that contradict the previous fit are excluded first: a magnet nearby would bend a
         fit of all rows.
         """
         disturbed = _is_wild(rows)

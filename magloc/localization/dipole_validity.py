@@ -109,7 +109,7 @@ def nearness_test(
 
     A quadrupole and then an octupole at the solution are added to the linearised dipole. Either is significant if χ²
     decreases by more than noise explains, and by more per parameter than the remaining misfit (F test at 5 %). The
-    octupole is left out if it would leave no degree of freedom. A too large χ² is a finding of its own. Each of the
+    octupole is omitted if it would leave no degree of freedom. A too large χ² is a separate finding. Each of the
     three tests has a third of the false-alarm rate.
 
     ``array``: array with the noise that decides what is significant. ``position_m``, ``moment_Am2`` (3,): solution of a

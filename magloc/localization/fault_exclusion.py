@@ -38,7 +38,7 @@ _SPOILT = 4.0
 _BEYOND_DOUBT = 10.0
 # Factor in χ² per degree of freedom by which a fix must be better if it explains the other sensors badly.
 _INCOMPARABLE = 1000.0
-# Largest arrays in which each pair of sensors, and each single sensor, is left out. In larger arrays only suspects are.
+# Largest arrays in which each single sensor, and each pair, is excluded in turn; in larger arrays only suspects.
 _MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
 # Number of fits without one sensor that are refined, lowest expected χ² first, and number that are kept for a row.
 _MOST_REFINED, _MOST_KEPT = 6, 3
@@ -49,7 +49,7 @@ _MATTERS = 0.05
 # Share of a sensor's readings, along any direction, that the other sensors check. Below the first value a fit without
 # the sensor is always refined. A faulty sensor that attracts the source has less than the second value.
 _HALF_CHECKED, _LEAST_CHECKED = 0.5, 0.1
-# Number of suspect sensors of a larger array that are left out of a new search, one at a time.
+# Number of suspect sensors of a larger array that are excluded from a new search, one at a time.
 _MOST_SEARCHED = 2
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
@@ -131,7 +131,7 @@ def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Start of a reweighting: fit q (K, 4), mu (K, 3), sensors left out, and whether it is credible.
+    """Start of a reweighting: fit q (K, 4), mu (K, 3), excluded sensors, and whether it is credible.
 
     A fit without degrees of freedom is not credible.
     """
@@ -281,7 +281,7 @@ class _Examination:
     def _refine_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
         """Return the plain fits and the best fits without one sensor, best first.
 
-        A row is left out if no sensor is an outlier and each sensor is checked by the others.
+        A row is skipped if no sensor is an outlier and each sensor is checked by the others.
         """
         every = self._starts([(row, plain[row]) for row in rows.tolist()])
         starts: dict[int, list[_Start]] = {row: [] for row in rows.tolist()} | {row: [start] for row, start in every}
@@ -417,7 +417,7 @@ class _Examination:
     def _certain_faults(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
         """Return sensors that are certainly faulty: the only credible fit leaves them out.
 
-        In that fit they are outliers beyond doubt, and no other sensor would be an outlier even if left out.
+        In that fit they are clear outliers, and no other sensor would be an outlier even if excluded.
         """
         only = [(row, tried[0]) for row, tried in starts.items() if len(tried) == 1 and tried[0].explains]
         found: dict[int, frozenset[int]] = {}

@@ -67,7 +67,7 @@ class Locator:
         Known position of the source in the array's frame [m], for all rows or for each row; only its moment is fitted.
         With several sources, n is 1 for all rows.
     prior : SourcePrior
-        Bounds of position and moment for every source; solutions outside of them are left out.
+        Bounds of position and moment for every source; solutions outside of them are rejected.
     body_length_m : float, optional
         Length of the object. The deviation of its field from a dipole counts as noise, and fixes nearer than three
         lengths are flagged `too_near`. By default the length is a quarter of the distance if four sensors are nearer
@@ -345,7 +345,7 @@ def locate(
     position_m : array_like, shape (3,) or (K, 3), optional
         Known position of the source, or of K sources [m], in the frame of the results; only moments are fitted.
     prior : SourcePrior
-        Bounds of position and moment for every source; solutions outside of them are left out.
+        Bounds of position and moment for every source; solutions outside of them are rejected.
     ambient_T : array_like, shape (n, 3) or (3,), optional
         Ambient field in the array's frame [T], in place of that of the readings or the array.
     body_length_m : float, optional

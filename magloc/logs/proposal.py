@@ -46,7 +46,7 @@ def propose_log_columns(log: Log) -> Proposal:
     about = f"{log.kind}. Channels, by the messages that share their times:"
     channels: dict[str, str] = {}
     for topic in log.topics:
-        is_inside = topic.name in channels  # a sensor of the same message with a clock of its own
+        is_inside = topic.name in channels  # a sensor of the same message with a separate clock
         name = f"{topic.name} (own clock of {next(iter(topic.fields))})" if is_inside else topic.name or "table"
         channels[name] = _described(topic)
     lines = (_FRONT_RIGHT_DOWN,) if is_autopilot else ()
@@ -63,7 +63,7 @@ def _sensors(log: Log, asked: list[str]) -> dict[str, tuple[str, ...]]:
         ]
         known = known or [(name,) for name in fields]  # type: ignore[misc]
     working = [names for names in known if any(readings_vary(log[name].values[:, None]) for name in names)]
-    asked += [f"{names[0]} stands still: it is left out" for names in known if names not in working]
+    asked += [f"{names[0]} does not change: it is ignored" for names in known if names not in working]
     return {f"s{k}": names for k, names in enumerate(working, start=1)}
 
 

@@ -30,12 +30,12 @@ def table_of_file(path: str | PathLike[str], form: LogFormat) -> Table:
         return form.table(read_text(path, "a CSV file", form.encoding), str(path))
     logged, n_left_out = _table_of_log(read_log(path), form)
     if n_left_out:
-        _LOG.warning(f"{path}: {n_left_out} rows are outside the attitude or in its gaps, and are left out")
+        _LOG.warning(f"{path}: {n_left_out} rows lie outside the attitude's times or in its gaps, and are ignored")
     return form.translate(logged)
 
 
 def _table_of_log(log: Log, form: LogFormat) -> tuple[Table, int]:
-    """Return the columns of a log that a format names, in the units of the log, and the number of rows left out.
+    """Return the columns of a log that a format names, in the units of the log, and the number of rows ignored.
 
     The rows are those of the first sensor, as far as there is an attitude, if one is named. Other channels are
     interpolated to its times; they are missing in gaps.

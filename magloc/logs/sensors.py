@@ -75,7 +75,7 @@ class LogSensors:
     own_attitude : tuple of (ndarray, Rotation), optional
         Times and attitudes that the log itself states, east, north, up from the axes of the log.
     warnings : tuple of str
-        Sentences about sensors that are left out.
+        Sentences about sensors that are ignored.
     """
 
     gyro: VectorReadings
@@ -97,7 +97,7 @@ def find_sensors(log: Log) -> LogSensors:
     found = list(_candidates(log, _MAGNETOMETERS))
     working = [sensor for sensor in found if readings_vary(sensor.values)]
     warnings = [
-        f"{log.path}: the magnetometer {sensor.name} stands at {sensor.values[0].tolist()} T and is left out"
+        f"{log.path}: the magnetometer {sensor.name} reads {sensor.values[0].tolist()} T in all rows and is ignored"
         for sensor in found
         if sensor not in working
     ]

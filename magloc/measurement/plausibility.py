@@ -76,7 +76,7 @@ def warn_of_record(array: SensorArray, readings: Readings) -> None:
 def warn_of_moments(distance_m: ArrayLike, moment_Am2: ArrayLike) -> None:
     """Warn of moments (n, 3) that are implausible at distances (n,) from the sensors.
 
-    NaN are left out.
+    NaN are ignored.
     """
     _warn(moment_doubts(distance_m, moment_Am2))
 
@@ -148,7 +148,7 @@ def array_doubts(array: SensorArray, readings: Readings | None = None) -> Iterat
 def moment_doubts(distance_m: ArrayLike, moment_Am2: ArrayLike) -> Iterator[str]:
     """Yield a sentence on moments (n, 3) that are implausible at distances (n,).
 
-    Distances are from the sensors; NaN are left out.
+    Distances are from the sensors; NaN are ignored.
     """
     distance, strength = np.asarray(distance_m, np.float64), np.linalg.norm(moment_Am2, axis=-1)
     known = np.isfinite(distance) & np.isfinite(strength)

@@ -33,7 +33,7 @@ _SOURCE_ENDS = {
     SourceStatus.FOUND: (style.BLUE, "", "found"),
     SourceStatus.MISSED: (style.ORANGE, "", "missed"),
     SourceStatus.UNSOLVED: (style.BLACK, "", "no solution"),
-    SourceStatus.LEFT_OUT: (_WHITE, "", "left out"),
+    SourceStatus.LEFT_OUT: (_WHITE, "", "excluded"),
 }
 _SOURCES_COLOURS = ListedColormap([colour for colour, _, _ in _SOURCE_ENDS.values()])
 

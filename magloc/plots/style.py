@@ -271,7 +271,7 @@ def shade_gaps(ax: Axes, time_s: FloatArray, present: NDArray[np.bool_], label: 
     """Hatch the times of successive rows without data."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~present, [False]]).astype(np.int8))).reshape(-1, 2)
     begin_s, end_s = time_s[np.maximum(edges[:, 0] - 1, 0)], time_s[np.minimum(edges[:, 1], len(time_s) - 1)]
-    # A patch of its own for each of thousands of gaps takes minutes: gaps below a pixel are left out, the rest is one.
+    # One patch for each of thousands of gaps takes minutes: gaps below a pixel are omitted, the rest is one patch.
     seen = end_s - begin_s > np.ptp(time_s) / _PIXELS
     if seen.any():
         spans = np.column_stack([begin_s, end_s - begin_s])[seen].tolist()

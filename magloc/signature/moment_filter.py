@@ -76,7 +76,7 @@ class MomentModel:
     turn_rad_s : float
         Characteristic rate of change of θ, relative to its modulus; it gives S_q.
     begins : ndarray of bool, shape (n,)
-        Rows at which a path begins; each path has an error of its own.
+        Rows at which a path begins; each path has a separate error.
     """
 
     rows: tuple[RowMeasurement, ...]

@@ -174,7 +174,7 @@ def track_moment(
         Raw readings [T] in the order of time, NaN where missing. Saturated readings are not used.
     path : ObjectPath or array_like, shape (3,) or (n, 3)
         Position of the object in the frame of the results [m]: one place, one for every row, or a path whose times
-        enclose those of the readings; rows outside it are left out. The moment turns with the attitude of the path if
+        enclose those of the readings; rows outside it are ignored. The moment turns with the attitude of the path if
         there is one, otherwise with the rates of the readings.
     turn_rad_s : float
         Characteristic rate at which the moment turns, or changes in another way.
@@ -338,7 +338,7 @@ def moment_model(
     path_error: PathError,
     turn_rad_s: float,
 ) -> MomentModel:
-    """Return the model of successive records, each with places (n, K, 3) of its own."""
+    """Return the model of successive records, each with its own places (n, K, 3)."""
     check_magnitudes(array)
     background = BackgroundDrift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
     measurements = RowMeasurements(array, N_SOURCE, background)

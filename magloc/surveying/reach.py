@@ -21,7 +21,7 @@ def least_moments(
     """Return places (k, 3) below a rectangle, and the moments (k,) that are found with 95 %.
 
     The moments hold for the worst direction. A moment is found if a noncentral χ² with 3 degrees of freedom,
-    moment·information·moment, exceeds the threshold. Places where the rows have no information are left out.
+    moment·information·moment, exceeds the threshold. Places where the rows have no information are omitted.
     """
     record = model.record
     directions = record.directions(sources.fields(record))

@@ -98,7 +98,7 @@ class SurveyModel:
         return np.asarray(np.median(self.record.flat_m[..., 2]) - flat_m[:, 2])
 
     def fit(self, sources: Sources, group: IntArray, settled: float) -> tuple[JointFit, SurveyBackground]:
-        """Fit sources and drop those that are not significant or out of bounds, until none is left."""
+        """Fit sources and drop those that are not significant or out of bounds, until none remains."""
         for weighing in range(_MOST_WEIGHINGS):
             background = self.background(sources, group)
             fit = fit_jointly(self.record, background, sources, self._around(sources), settled=settled)

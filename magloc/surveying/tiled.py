@@ -86,7 +86,7 @@ class TiledSurvey:
         alone = [tile for tile in tiles if len(tile.rows) < FEWEST_ROWS]
         if alone:
             rows = sum(int(tile.own.sum()) for tile in alone)
-            _LOG.warning(f"rows that are far from all others are left out: {rows}")
+            _LOG.warning(f"rows that are far from all others are ignored: {rows}")
         tiles = [t for t in tiles if len(t.rows) >= FEWEST_ROWS and _narrow(ground.prior, t, margin_m) is not None]
         if not tiles:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows near each other; instead received none.")

@@ -1,4 +1,4 @@
-"""Tiles of a large survey: squares with a margin of rows, each a survey of its own."""
+"""Tiles of a large survey: squares with a margin of rows, each surveyed separately."""
 
 from __future__ import annotations
 

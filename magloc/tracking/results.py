@@ -77,7 +77,7 @@ class TrackPoint:
         average for a right model, and less if predictions are better than their covariance. NaN without a prediction,
         and if errors of sensors or pose are states.
     dropped_sensors : tuple of str
-        Sensors left out because they contradict the others.
+        Sensors excluded because they contradict the others.
     mixture : Mixture, optional
         Gaussian mixture of position and moment; None for a track that is read from a file.
     """
@@ -178,7 +178,7 @@ class SourcesPoint:
     dof : int
         Number of its readings.
     dropped_sensors : tuple of str
-        Sensors that are left out.
+        Sensors that are excluded.
     """
 
     time_s: float

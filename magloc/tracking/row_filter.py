@@ -94,7 +94,7 @@ class RowUpdates:
         Squared correction of the prediction by the readings, in its standard deviations, minus its mean.
     standardised : ndarray, shape (C, n_sensors, 3), optional
         Residuals of each sensor's channels, of unit covariance. Their sum of squares is the decrease of `nis` if the
-        readings of the sensor are left out.
+        readings of the sensor are ignored.
     misfits : ndarray, shape (C, 2, k), optional
         Readings minus predicted ones, at the prediction and after the update.
     projectors : ndarray, shape (C, 2, d, k), optional

@@ -15,7 +15,7 @@ SENSOR_LIMIT = 32.0
 RIVAL_WITHIN = 9.0
 """Least difference of χ² between leaving out a sensor and leaving out any other, for which it is at fault."""
 ROWS_TO_DIE = 3.0
-"""Rows in which a sensor is left out before it counts as dead, so that single spikes do not count."""
+"""Rows in which a sensor is excluded before it counts as dead, so that single spikes do not count."""
 ROWS_TO_RETURN = 50
 """Successive good rows after which a dead sensor is used again."""
 DRIFT_LIMIT = 40.0
@@ -98,11 +98,11 @@ class SensorHealth:
     Attributes
     ----------
     dead : ndarray of bool, shape (N,)
-        Sensors that are left out until they recover.
+        Sensors that are excluded until they recover.
     drifting : ndarray of bool, shape (N,)
         Dead sensors that drifted.
     strikes : ndarray, shape (N,)
-        Count of recent rows in which a sensor was left out.
+        Count of recent rows in which a sensor was excluded.
     good : ndarray of int, shape (N,)
         Successive good rows of a dead sensor.
     sums : ndarray, shape (4, N, 3)
@@ -129,7 +129,7 @@ class SensorHealth:
 
     @property
     def is_well(self) -> bool:
-        """True if no sensor is dead or was left out recently."""
+        """True if no sensor is dead or was excluded recently."""
         return not (self.dead.any() or self.strikes.any())
 
     @property
@@ -157,7 +157,7 @@ class SensorHealth:
         residuals : ndarray, shape (N, 3)
             Standardised residuals, NaN without a reading.
         out : ndarray of bool, shape (N,)
-            Sensors left out of the row.
+            Sensors excluded from the row.
         dead_chi2 : ndarray, shape (N,)
             χ² of the dead sensors given the others.
         """

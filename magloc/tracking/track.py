@@ -149,7 +149,7 @@ class TrackColumns(TrackRows[TrackPoint]):
 
     @property
     def dropped_sensors(self) -> list[tuple[str, ...]]:
-        """Sensors left out of each row because they contradict the others."""
+        """Sensors excluded from each row because they contradict the others."""
         return [point.dropped_sensors for point in self]
 
     @property

@@ -250,7 +250,7 @@ class Tracker(CartesianFilter):
         return TrackPoint(row.time_s, status=reason, centroid_m=centroid_m, radius_m=self.array.circumradius)
 
     def _start_track(self, row: Row, index: int, near: Mixture | None = None) -> tuple[BoolArray, TrackPoint]:
-        """Start a new track if possible; return the sensors (N,) left out of the row, and its point."""
+        """Start a new track if possible; return the excluded sensors (N,) and the point."""
         self._known, out = None, self._health.dead
         measurement = self._measure(row, out)
         if measurement.z.size < N_SOURCE:
@@ -279,7 +279,7 @@ class Tracker(CartesianFilter):
         return self.measurements.of(replace(row, readings_T=readings) if out.any() else row, source)
 
     def _follow_track(self, before: TrackState, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
-        """Continue a track by one row; return the sensors (N,) left out, and the point."""
+        """Continue a track by one row; return the excluded sensors (N,) and the point."""
         dead = self._health.dead
         measurement = self._measure(row, dead)
         predicted = self.filter.predict(before.mixture, self.motion, dt_s, measurement)
@@ -342,7 +342,7 @@ class Tracker(CartesianFilter):
         )
 
     def _update_health(self, row: Row, out: BoolArray, excess: Callable[[RowMeasurement], float]) -> None:
-        """Update the sensors' health by those left out (N,), and the χ² of each dead one."""
+        """Update the sensors' health by the excluded ones (N,), and the χ² of each dead one."""
         if self._health.is_well and not out.any():
             return
         dead_chi2, available = np.full(len(out), np.inf), np.unique(self.array.channel_sensor[row.available])
@@ -355,7 +355,7 @@ class Tracker(CartesianFilter):
     ) -> tuple[BoolArray, RowUpdate, bool]:
         """Repeat a contradicting update without the sensor at fault.
 
-        Return the sensors (N,) left out, the update, and whether a single sensor may be at fault.
+        Return the excluded sensors (N,), the update, and whether a single sensor may be at fault.
         """
         dead, own = self._health.dead, np.eye(self.array.n_sensors, dtype=bool)
         found = {sensor: update_without(dead | own[sensor]) for sensor in np.flatnonzero(~dead).tolist()}

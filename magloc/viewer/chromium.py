@@ -290,7 +290,7 @@ def _start(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Popen
         "--headless=new",
         "--disable-dev-shm-usage",
         "--disable-background-networking",
-        "--disable-features=BackForwardCache",  # otherwise a page that was left keeps its socket
+        "--disable-features=BackForwardCache",  # otherwise a closed page keeps its socket
         "--no-first-run",
         "--no-proxy-server",
         "--hide-scrollbars",

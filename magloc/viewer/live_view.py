@@ -21,7 +21,7 @@ from magloc.viewer.view import View
 class LiveView(View):
     """Page of tracked sources: scene, readings, residuals, rate, latency and lost rows.
 
-    A thread of its own draws the newest point, so that no row waits for the page. As a context manager it closes the
+    A separate thread draws the newest point, so that no row waits for the page. As a context manager it closes the
     page at the end.
 
     Parameters

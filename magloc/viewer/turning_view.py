@@ -25,7 +25,7 @@ _FRAMES_PER_SECOND = 20.0
 
 
 class TurningView(View):
-    """Page of a calibration by turning; a thread of its own draws the newest row.
+    """Page of a calibration by turning; a separate thread draws the newest row.
 
     Parameters
     ----------

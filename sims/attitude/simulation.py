@@ -55,7 +55,7 @@ class PreparedRuns:
     momentum_Nms: FloatArray
     torque_Nm: FloatArray  # (runs, n, 3): disturbing torque in body axes, held from each instant to the next
     dipole_Am2: FloatArray  # (runs, n, 3): besides the residual dipole of the satellite, held likewise
-    torquers_Am2: FloatArray  # (runs, n, 3): commanded, as the filters are told
+    torquers_Am2: FloatArray  # (runs, n, 3): commanded, as the filters know it
     gyro_bias_rad_s: FloatArray  # (runs, n, 3)
     field_bias_T: FloatArray  # (runs, n, 3)
     field_gain: FloatArray  # (runs, 3, 3): D of a magnetometer that reads (E + D) b

@@ -76,7 +76,7 @@ def _paper_rows() -> Iterator[PaperRow]:
 
 
 PAPER_ROWS = tuple(_paper_rows())
-"""All rows. The value of Table 5 for Δb, 6e-1°, is left out: its exponent is illegible and its unit differs.
+"""All rows. The value of Table 5 for Δb, 6e-1°, is omitted: its exponent is illegible and its unit differs.
 
 The three rows ST+G, [λ, ω], [λ, ω, Δω] and [λ, Δω], have the numbers of the one legible line.
 """

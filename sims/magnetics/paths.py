@@ -142,7 +142,7 @@ class Waypoints:
         along = np.minimum(way - (ends - lengths)[leg], lengths[leg])
         direction = legs / lengths[:, None]
         velocity = np.where((way < ends[-1])[:, None], self.speed_m_s * direction[leg], 0.0)
-        # A vertical leg has no course of its own: that of the leg before it stands, north at the very first.
+        # A vertical leg has no course: it keeps that of the leg before it; north at the start.
         courses = np.arctan2(legs[:, 0], legs[:, 1])
         horizontal = np.hypot(legs[:, 0], legs[:, 1]) > _SAME_PLACE_M
         last = np.maximum.accumulate(np.where(horizontal, np.arange(len(legs)), -1))

@@ -85,7 +85,7 @@ class TestFirstMinute:
 
 
 def test_a_sensor_that_lies_is_named() -> None:
-    """Story 3; a good sensor is left out of one row in a thousand."""
+    """Story 3; a good sensor is excluded from one row in a thousand."""
     array = arrays.grid(3, 2, 1.0, noise_T=2e-10)
     readings = magloc.Readings(readings_of(array, POSITION[None], MOMENT[None]))
     bent = readings.values_T.copy()

@@ -23,4 +23,4 @@ def test_a_foreign_package_is_refused_in_a_sentence(name: str, ours: str, tmp_pa
     assert ended.returncode == 1
     said = ended.stderr.splitlines()[-1]
     assert said.startswith(f"ImportError: magloc found the package {name} at {tmp_path}")
-    assert said.endswith("Install magloc into an environment of its own.")
+    assert said.endswith("Install magloc into a separate environment.")

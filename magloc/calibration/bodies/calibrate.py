@@ -183,7 +183,7 @@ def calibrate_body(
 
 
 def _without_errors(array: SensorArray) -> SensorArray:
-    """Return the array without the errors of its sensors that are estimated here, so that only noise is left."""
+    """Return the array without the errors of its sensors that are estimated here, so that only noise remains."""
     sensors = [
         replace(sensor, gain_uncertainty=0.0, misalignment_rad=0.0, offset_uncertainty_T=0.0)
         for sensor in array.sensors
@@ -297,7 +297,7 @@ def _locate(problem: BodyProblem, rows: IntArray) -> BodyPoses:
 def _start(problem: BodyProblem) -> tuple[BodyProblem, BodyState, BoolArray]:
     """Return a problem and a state near its optimum, and which rows are kept.
 
-    A row without a pose is left out, and so is one in a wrong optimum.
+    Rows without a pose, or in a wrong optimum, are excluded.
     """
     state = _nominal_state(problem)
     unknown = np.flatnonzero(~problem.has_pose)

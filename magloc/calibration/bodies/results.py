@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of rows that were left out of a calibration and located with it.
+    """Errors of rows that were held out of a calibration and located with it.
 
     Attributes
     ----------

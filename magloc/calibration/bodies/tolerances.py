@@ -24,7 +24,7 @@ def with_posterior(
 
     Files state independent errors of single sensors and magnets. The posterior errors are correlated: most of them
     cancel in the readings. The stated ones are scaled by one factor, so that the variance of the readings that they
-    imply is that of the posterior. Directions that the readings do not show are left out.
+    imply is that of the posterior. Directions that the readings do not show are excluded.
     """
     value, vector = np.linalg.eigh(information)
     variance = np.where(value < UNSEEN, 0.0, 1.0 / (1.0 + np.maximum(value, 0.0)))

@@ -174,7 +174,7 @@ def _lines(result: BodyCalibration) -> list[str]:
 
 
 def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
-    """Return notes on rows and χ², on undetermined directions, and on left-out rows."""
+    """Return notes on rows and χ², on undetermined directions, and on held-out rows."""
     notes = fit_notes(result, n_rows, "the files")
     if result.cross_validation is not None:
         notes.append(_validation_note(result.cross_validation))
@@ -192,7 +192,7 @@ def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
 
 def _validation_note(errors: PoseErrors) -> str:
     """Return a note on how well the calibration carries over to other rows."""
-    text = f"cross-validation: rows left out of the calibration have χ² {errors.chi2:.4g} with {errors.dof:.0f} dof"
+    text = f"cross-validation: rows held out of the calibration have χ² {errors.chi2:.4g} with {errors.dof:.0f} dof"
     if not errors.error_m.size:
         return text
     entries = errors.json

@@ -83,7 +83,7 @@ def calibrate(
     truth : Path
         Truth file (CSV) of the source. Its rows belong to the readings of the same time. Without z_m one height is
         estimated for all rows. Moments in it are taken as known; with axis_x, axis_y, axis_z one strength is estimated.
-        sigma_m is the error of its positions. Rows are left out in turn to say how well the calibration carries over.
+        sigma_m is the error of its positions. Rows are held out in turn to test the calibration on others.
         With --body it has the attitude qx, qy, qz, qw too, and sigma_deg is its error.
     modulus_nT : str
         Modulus of the uniform field in which the sensors were turned [nT]: a number, or a CSV file with time_s and
@@ -172,15 +172,15 @@ def _validation_notes(validation: CrossValidation, background: str | None) -> li
     """Return notes on how well the calibration carries over to other rows."""
     numbers = validation.json
     if not numbers["rows"]:
-        return ["cross-validation: no row that was left out can be located; the calibration does not carry over"]
+        return ["cross-validation: no row that was held out can be located; the calibration fits no other rows"]
     median, p90, worst = (1e3 * numbers[name] for name in ("median_m", "p90_m", "worst_m"))
     notes = [
-        f"cross-validation: rows left out of the calibration are located to {median:.3g} mm (median), {p90:.3g} mm"
+        f"cross-validation: rows held out of the calibration are located to {median:.3g} mm (median), {p90:.3g} mm"
         f" (90 %), {worst:.3g} mm (worst)"
     ]
     if background is not None:
         notes.append(
-            "the offsets contain the background of the array at rest; left-out rows are located better if the array"
+            "the offsets contain the background of the array at rest; held-out rows are located better if the array"
             " file states a small common field, so it states one: calibrate again when the array moves"
         )
     return notes

@@ -7,7 +7,7 @@ the steps of a filter depend on each other: they are computed in order, with one
     int64_t magloc_<kernel>(const magloc_<problem> *problem, int64_t begin, int64_t end, double *workspace);
 
 With workspace = NULL a kernel computes nothing and returns the number of doubles that its workspace must have.
-Otherwise it returns 0. Each thread needs a workspace of its own. Kernels allocate nothing, do not check their input and
+Otherwise it returns 0. Each thread needs its own workspace. Kernels allocate nothing, do not check their input and
 never fail: what cannot be computed is NaN.
 
 All quantities are in SI units: m, A m^2, T, s, rad.
@@ -185,7 +185,7 @@ int64_t magloc_lag_changes(const magloc_lags *problem, int64_t begin, int64_t en
 /* How the states of a heading filter move on in each block: the heading, the gyro's drift, scales of its axes, the
    sensor's offset, and the slow and the quick variation of the room's field. */
 typedef struct {
-  const double *kept;   /* (n_blocks, 14): part of each state that is left */
+  const double *kept;   /* (n_blocks, 14): part of each state that remains */
   const double *growth; /* (n_blocks, 14): of its variance */
 } magloc_heading_room;
 
@@ -403,7 +403,7 @@ typedef struct {
 } magloc_pose_search;
 int64_t magloc_search_poses(const magloc_pose_search *problem, int64_t begin, int64_t end, double *workspace);
 
-/* A body followed by one Gaussian over rows, each with a set of channels of its own or one for all; an item is a row.
+/* A body followed by one Gaussian over rows, each with its own set of channels or one for all; an item is a row.
    States are the pose (position, then a small rotation in the body's frame), errors of the magnets and of the sensors,
    and the rates: velocity in the array's frame, rotation rate in the body's. Positions are in radii. */
 typedef struct {
@@ -511,7 +511,7 @@ typedef struct {
 } magloc_bound_array;
 
 /* Cramer-Rao bounds of sources: least standard deviations of any unbiased estimate from one set of readings; an item is
-   a source. Each place has the same moments, or moments of its own; source n_moments * i + k is at place i. */
+   a source. All places have the same moments, or each has its own; source n_moments * i + k is at place i. */
 typedef struct {
   const magloc_bound_array *array;
   int64_t n_moments, moments_are_own;
@@ -532,7 +532,7 @@ int64_t magloc_source_bounds(const magloc_bounds *problem, int64_t begin, int64_
 typedef struct {
   int64_t n_states, n_measurements;
   const double *H;            /* (n_rows, n_measurements, n_states) */
-  const double *kept, *added; /* (n_rows, n_states): part of each state that is left; growth of its variance */
+  const double *kept, *added; /* (n_rows, n_states): part of each state that remains; growth of its variance */
   const double *dt;           /* (n_rows) */
   const double *start;        /* (n_states), variances before the first step */
   double *gains;              /* (n_rows, n_measurements, n_states + 1): Kalman gains, and the innovation's 1/sigma */
@@ -540,7 +540,7 @@ typedef struct {
 int64_t magloc_survey_gains(const magloc_survey_filter *problem, int64_t begin, int64_t end, double *workspace);
 
 /* Innovations of columns over their standard deviation, by a filter whose gains are known; an item is a row of them,
-   all in order. Rows of the filter that are left out have columns of zeros. */
+   all in order. Rejected rows of the filter have columns of zeros. */
 typedef struct {
   const magloc_survey_filter *filter;
   int64_t n_columns;

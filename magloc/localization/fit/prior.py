@@ -21,7 +21,7 @@ _DEFAULT_SIGMA = 0.1
 
 @dataclass(frozen=True)
 class SourcePrior:
-    """Prior knowledge of a source; solutions outside its bounds are left out.
+    """Prior knowledge of a source; solutions outside its bounds are rejected.
 
     Attributes
     ----------

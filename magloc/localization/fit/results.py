@@ -177,7 +177,7 @@ class Fix:
         True if the readings exceed noise, with one false alarm in a thousand rows. Otherwise, or if there is no test,
         the solutions are fits of noise and nothing is known of the range.
     dropped_sensors : tuple of str
-        Ids of sensors that contradict all others, and were left out.
+        Ids of sensors that contradict all others, and were excluded.
     saturated_channels : tuple of str
         Names of the channels without a reading because they saturate.
     too_near : bool

@@ -173,7 +173,7 @@ def modulus_scores(templates: SingleArray, residual: FloatArray) -> tuple[FloatA
 def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float) -> NDArray[np.intp]:
     """Return the best candidates (b, n_starts) by scores (b, n), some angle apart.
 
-    The best is repeated if none is left.
+    The best is repeated if none remains.
     """
     left = scores.copy()
     chosen = np.empty((len(scores), n_starts), dtype=np.intp)

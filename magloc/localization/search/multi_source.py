@@ -220,7 +220,7 @@ class _Levels:
         return found
 
     def _is_weak(self) -> BoolArray:
-        """Return which rows need no search for more sources, because only noise is left."""
+        """Return which rows need no search for more sources, because only noise remains."""
         if self.asked is not None or self.most == 1:
             return np.zeros(len(self.y), dtype=bool)
         energy = self.rows.energy

@@ -26,7 +26,7 @@ class WhiteningFilter:
     H : ndarray, shape (n, k, S)
         Measurement matrices.
     kept, added : ndarray, shape (n, S)
-        Part of each state that is left in a step, and growth of its variance.
+        Part of each state that remains after a step, and growth of its variance.
     dt_s : ndarray, shape (n,)
         Steps.
     start : ndarray, shape (S,)

@@ -84,7 +84,7 @@ class Exclude(_Decision, frozen=True, tag_field="action", tag="exclude"):
 
 
 class Refit(_Decision, frozen=True, tag_field="action", tag="refit"):
-    """Fit all targets to all rows that are left."""
+    """Fit all targets to all remaining rows."""
 
 
 Decision = Drop | Split | Add | Exclude | Refit

@@ -136,7 +136,7 @@ class Review:
         processes: int | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> Review:
-        """Fit all targets to all rows that are left, jointly, and keep all of them.
+        """Fit all targets jointly to all remaining rows, and keep all of them.
 
         Parameters
         ----------

@@ -21,7 +21,7 @@ from magloc.surveying.tiles import assign_sources
 _LOG = logging.getLogger(__name__)
 _MISFIT = 2.0
 Names = Callable[[FloatArray], Sequence[str]]
-"""Names of targets at positions (K, 3), the most significant one first; one without a name is left out."""
+"""Names of targets at positions (K, 3), the most significant one first; targets without a name are omitted."""
 
 
 def numbered(position_m: FloatArray) -> list[str]:

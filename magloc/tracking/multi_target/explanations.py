@@ -35,7 +35,7 @@ MOST_BY_ITSELF = 5
 """Largest number of sources that are searched for one by one; a search for more takes seconds and fails."""
 # Squared Mahalanobis distance below which two sources are the same.
 _SAME_SIGMA2 = 1.0
-# Penalty of a sensor left out: 1.5 times the mean χ² of its three readings, so that a good one is not left out.
+# Penalty of an excluded sensor: 1.5 times the mean χ² of its three readings, so that good sensors are kept.
 _LEFT_OUT = 4.5
 # Number of cells from which a birth starts, and the least energy in them.
 _BIRTH_STARTS = 4
@@ -63,7 +63,7 @@ _NEXT_TO_NO_MOMENT = np.array([0.0, 0.0, 1e-30])
 # Factor of the prior σ of a late birth, and number of its starts.
 _LATE_SPREAD, _LATE_STARTS = 2.0, 8
 _MUCH_STRONGER = 100.0
-# Largest share of a source's energy in one sensor; with more it cannot be told from a fault.
+# Largest share of a source's energy in one sensor; with more it cannot be distinguished from a fault.
 _LONELY = 0.9
 # Prior σ of a new source: direction of the moment [rad], ln of its strength, position over distance.
 _TURN, _LOG_STRENGTH, _PLACE = 1.0, 1.5, 0.5
@@ -96,7 +96,7 @@ class Explanation:
     ids : tuple of int
         Ids of the sources.
     out : ndarray of bool, shape (N,)
-        Sensors that are left out.
+        Sensors that are excluded.
     penalty : float
         Sum of the penalties of the events.
     """
@@ -277,7 +277,7 @@ class RowProblem:
             yield self.update(alone, (*others, min(ids[first], ids[second])), found.out, penalty)
 
     def _expand(self, found: Explanation) -> list[Explanation]:
-        """Return the explanations with one more event: a sensor left out, a death or a birth."""
+        """Return the explanations with one more event: an excluded sensor, a death or a birth."""
         if id(found) not in self.further:
             self.further[id(found)] = found, list(self._events(found))
         return self.further[id(found)][1]

@@ -63,7 +63,7 @@ class SourcesTrack(TrackRows[SourcesPoint]):
 
     @property
     def dropped_sensors(self) -> tuple[str, ...]:
-        """Sensors that are left out of some row."""
+        """Sensors that are excluded from at least one row."""
         return tuple(sorted({name for point in self for name in point.dropped_sensors}))
 
     def of(self, id: int) -> SourceTrack:
@@ -109,7 +109,7 @@ def track_sources(
 
     Each reading is a sum over all sources, so that there is no data association; crossing sources are distinguished by
     their motion. A source is added if the readings support another, and removed if they support one fewer. A sensor
-    that fails is reported, and left out until it recovers.
+    that fails is reported, and excluded until it recovers.
 
     Parameters
     ----------

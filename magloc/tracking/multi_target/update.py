@@ -52,7 +52,7 @@ class JointUpdate:
 
     @property
     def sensor_chi2(self) -> FloatArray:
-        """Decrease of χ² (N,) if each sensor is left out, with three degrees of freedom."""
+        """Decrease of χ² (N,) if each sensor is excluded, with three degrees of freedom."""
         return np.vecdot(self.standardised, self.standardised)
 
     @property
@@ -85,7 +85,7 @@ def joint_update(prior: JointState, row: JointRow, most: int = MOST_TRIALS) -> J
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:
-    """Return χ² (N,) of sensors left out of a state, of 3 dimensions; infinite for others."""
+    """Return χ² (N,) of the sensors excluded from a state, of 3 dimensions; infinite for others."""
     chi2 = np.full(len(sensors), np.inf)
     available = sensors & row.used.reshape(-1, 3).all(axis=1)
     if not available.any():

@@ -99,7 +99,7 @@ class LiveSource:
 
 
 class LivePage:
-    """Page that draws the newest row in a thread of its own, so that the caller never waits.
+    """Page that draws the newest row in a separate thread, so that the caller never waits.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ class LivePage:
             self._message.content = texts.panel_html([escape(str(error))], warning=True)
 
     def _draw(self, is_new: bool) -> float | None:
-        """Draw the newest row and, less often, the plots; return the time until a plot that is left [s]."""
+        """Draw the newest row and, less often, the plots; return the time until the next pending plot [s]."""
         with self._lock:
             newest, window = self._newest, list(self._window)
         if newest is None:

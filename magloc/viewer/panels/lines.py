@@ -97,7 +97,7 @@ def lines_svg(lines: PlotLines, time_words: str) -> str:
 def cursor_svg(x: float | None) -> str:
     """Return a vertical line at a place in the plot before it; None hides the line.
 
-    The line is in a layer of its own, so that the browser does not redraw the plot when it moves.
+    The line is in a separate layer, so that the browser does not redraw the plot when it moves.
     """
     line = "" if x is None else f'<path class="now" d="M0 {_TOP:g}V{_BOTTOM:g}" transform="translate({x:.2f})"/>'
     return (

@@ -35,7 +35,7 @@ def time_strip(since_first_s: FloatArray, is_good: BoolArray, colour: Colour) ->
 
 
 class TimePlayer:
-    """Player of a time between 0 and a duration, with a thread of its own.
+    """Player of a time between 0 and a duration, in a separate thread.
 
     Parameters
     ----------

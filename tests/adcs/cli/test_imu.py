@@ -48,7 +48,7 @@ class TestImu:
         assert image.imread(tmp_path / "out" / "attitude.png").std() > 0.05
 
     def test_methods(self, adcs, log):
-        """A magnet comes to sit on the unit and goes: subtracted, or left out."""
+        """A magnet comes to sit on the unit and goes: subtracted, or ignored."""
         found = {}
         for method in ("auto", "plain", "reject", "subtract"):
             outcome = adcs("imu", log, "--method", method, "--json", "--quiet")
@@ -90,7 +90,7 @@ class TestImu:
         first, second = outcome.out.splitlines()
         assert first.startswith("1500 rows; a magnet that moves with the sensor was subtracted; disturbed in ")
         assert second.startswith("rms while it moved: ")
-        assert "minute 1: the field was left out" in adcs("imu", log, "--method", "reject").err
+        assert "minute 1: the field was ignored" in adcs("imu", log, "--method", "reject").err
 
     def test_without_truth(self, adcs):
         summary = json.loads(adcs("imu", IMU.path, "--json", "--quiet").out)

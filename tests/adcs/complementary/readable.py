@@ -62,7 +62,7 @@ def rotation_derivative(q: ArrayLike, v: ArrayLike) -> FloatArray:
 def gauss_newton_step(q: FloatArray, vectors: list[tuple[FloatArray, FloatArray]], mu: float = MU) -> FloatArray:
     """One step q - (AᵀA + μE)⁻¹Aᵀε, normalised.
 
-    ``q`` (4,): unit quaternion, reference from body. ``vectors``: unit vectors (3,); those with NaN are left out. With
+    ``q`` (4,): unit quaternion, reference from body. ``vectors``: unit vectors (3,); those with NaN are ignored. With
     one vector the turn around it stays as it is. Returns shape (4,).
     """
     present = [(body, reference) for body, reference in vectors if np.isfinite(body).all()]

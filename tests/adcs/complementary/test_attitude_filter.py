@@ -114,7 +114,7 @@ class TestReference:
     @pytest.mark.parametrize("seed", [30, 31])
     @pytest.mark.parametrize("kind", ["plain", "magnet", "room", "gaps"])
     def test_the_filter_in_numpy(self, kind: str, seed: int) -> None:
-        """From 2 s on the attitudes agree within a tenth of σ, σ to 2 %, and the same fields are left out.
+        """From 2 s on the attitudes agree within a tenth of σ, σ to 2 %, and the same fields are ignored.
 
         The filter in NumPy knows the usual steps from the start, and the filter for one reading learns them.
         """

@@ -171,7 +171,7 @@ class TestIntegration:
 
 class TestDoor:
     def test_magnets(self):
-        """Kept it spoils the heading, left out the gyro holds it, and subtracted the field tells it again."""
+        """Kept it spoils the heading, ignored the gyro holds it, and subtracted the field tells it again."""
         record, q, moving = motion(magnet=np.array([6e-6, -4e-6, 19e-6]))
         readings = record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T
         totals, left_out = {}, {}
@@ -190,9 +190,9 @@ class TestDoor:
         record, _, _ = motion(magnet=np.array([6e-6, -4e-6, 19e-6]))
         readings = record.time_s + 1e6, record.rate_rad_s, record.acceleration_m_s2, record.field_T
         (said,) = inertial_magnetic_filter(*readings, magnet="rejected").warnings
-        assert said.startswith("minute 1: the field was left out for ")
+        assert said.startswith("minute 1: the field was ignored for ")
         kept = inertial_magnetic_filter(*readings, magnet="kept").warnings
-        assert not any("left out" in sentence for sentence in kept)
+        assert not any("ignored" in sentence for sentence in kept)
 
     def test_sigma_about_the_axes(self):
         """The body's axes have that of the tilt and of the heading in the parts that they turn to."""

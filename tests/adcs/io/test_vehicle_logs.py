@@ -104,7 +104,7 @@ class TestText:
         write_flight(replace(FLIGHT, log=log), tmp_path / "log.csv")
         file = adcs.read_vehicle(tmp_path / "log.csv")
         assert [one.name for one in file.log.magnetometers] == ["field"]
-        assert file.warnings == ("mag1 has no readings that vary, and is left out",)
+        assert file.warnings == ("mag1 has no readings that vary, and is ignored",)
 
     def test_text_and_utc_columns_by_a_layout(self, tmp_path):
         """A magnetometer that the layout names is read once; cells of other columns may hold anything."""
@@ -181,7 +181,7 @@ class TestPx4:
         log = replace(FLIGHT.log, magnetometers=(FLIGHT.log.magnetometers[0], still))
         file = adcs.read_vehicle(px4_log(tmp_path / "log.ulg", log=log))
         assert [one.name for one in file.log.magnetometers] == ["sensor_mag"]
-        assert "sensor_mag[1].x stands at" in file.warnings[0]
+        assert "sensor_mag[1].x reads" in file.warnings[0]
 
     def test_no_magnetometer(self, tmp_path):
         with pytest.raises(arrays.InputError, match="found no readings of a magnetometer"):

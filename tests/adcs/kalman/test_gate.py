@@ -1,6 +1,6 @@
-"""Tests of the gate of the error-state filter: what contradicts the filter is left out, and what was wrong is found.
+"""Tests of the gate of the error-state filter: what contradicts the filter is rejected, and what was wrong is found.
 
-The oracle of a reading that is left out is the same record without it. Seeds were not chosen.
+The oracle of a rejected reading is the same record without it. Seeds were not chosen.
 """
 
 from __future__ import annotations

@@ -197,25 +197,25 @@ class TestFaults:
 
     @pytest.mark.parametrize("value_T", [0.0, 2e-5, np.nan])
     def test_magnetometer_that_stops(self, value_T):
-        """A sensor that stands at one value, at zero or reads nothing is left out from then on, and named."""
+        """A sensor that stands at one value, at zero or reads nothing is ignored from then on, and named."""
         flight = simulate_flight(9, replace(SHORT, magnetometers=2))
         log, (good, bad) = flight.log, flight.log.magnetometers
         values = np.where(bad.time_s[:, None] > 30.0, value_T, bad.values)
         found = adcs.calibrate_log(replace(log, magnetometers=(good, replace(bad, values=values))), field_T=FIELD_T)
-        words = "mag1 has no readings from 30.0" if np.isnan(value_T) else "mag1 stands at one value from 30.0"
+        words = "mag1 has no readings from 30.0" if np.isnan(value_T) else "mag1 keeps one value from 30.0"
         assert any(words in flag for flag in found.flags)
         error, covariance = parameter_errors(flight, found)
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
 
     @pytest.mark.parametrize("axis", range(3))
     def test_axis_that_stands(self, axis):
-        """One axis of a sensor stands while the others move: the sensor is left out from then on, and named."""
+        """One axis of a sensor stands while the others move: the sensor is ignored from then on, and named."""
         flight = simulate_flight(9, SHORT)
         mag = flight.log.magnetometers[0]
         values = mag.values.copy()
         values[mag.time_s > 40.0, axis] = values[mag.time_s <= 40.0, axis][-1]
         found = adcs.calibrate_log(replace(flight.log, magnetometers=(replace(mag, values=values),)), field_T=FIELD_T)
-        assert any("mag0 stands at one value from 40.0" in flag for flag in found.flags)
+        assert any("mag0 keeps one value from 40.0" in flag for flag in found.flags)
         error, covariance = parameter_errors(flight, found)
         assert error @ np.linalg.solve(covariance, error) < chi2.ppf(1.0 - 1e-3, len(error))
 

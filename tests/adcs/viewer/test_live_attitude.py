@@ -40,7 +40,7 @@ def test_sigma_about_body_axes() -> None:
     ("flags", "lines"),
     [
         ((), ["none"]),
-        (("field-left-out",), ["the field is left out"]),
+        (("field-left-out",), ["the field is ignored"]),
         (("magnet-subtracted", "heading-doubtful"), ["a magnet of 5 µT is subtracted", "heading-doubtful"]),
     ],
 )
@@ -61,6 +61,6 @@ def test_the_page_follows() -> None:
         body = page._scene._body.wxyz
         np.testing.assert_allclose(np.abs(np.dot(body, found[-1].q)), 1.0, atol=1e-9)
         view.update(estimate(Rotation.identity(), "field-left-out", time_s=-math.pi), tally)
-        wait_for(lambda: "left out" in page._panels["Disturbance"].content)
+        wait_for(lambda: "ignored" in page._panels["Disturbance"].content)
         assert len(page._window) == 1
     assert not page._thread.is_alive()

@@ -281,7 +281,7 @@ class TestTracks:
 
     @pytest.mark.parametrize("scale", ["UTC", "GPST"])
     def test_places_the_rows_of_a_log(self, scale: str, tmp_path: Path) -> None:
-        """Rows after the last solution are left out; those without a solution have an error."""
+        """Rows after the last solution are ignored; those without a solution have an error."""
         found = self.read(tmp_path, scale)
         assert found.array_position_m is not None
         assert found.interpolated_m is not None

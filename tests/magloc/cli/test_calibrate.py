@@ -183,7 +183,7 @@ class TestArrayFile:
         assert_recovered(posed, but_gain=True)
 
     def test_rows_are_matched_by_time(self, run: Run, files: Files) -> None:
-        """Rows without truth are left out, in whatever order the truth is."""
+        """Rows without truth are ignored, in whatever order the truth is."""
         truth = files.truth()
         lines = truth.read_text(encoding="utf-8").splitlines()
         truth.write_text("\n".join([lines[0], *lines[6:], "1000.5,0,0,0", ""]), encoding="utf-8")

@@ -84,7 +84,7 @@ class TestProgress:
         assert calibrator.fit() is None
 
     def test_a_magnet_nearby_is_flagged_until_it_is_gone(self):
-        """Rows with the magnet are left out; the calibration is that of the others."""
+        """Rows with the magnet are excluded; the calibration is that of the others."""
         calibrator = TurningCalibrator(board(), FIELD_T)
         calibrator.add(turned(200))
         during = calibrator.add(turned(80, magnet=slice(0, 80), begin_s=100.0))

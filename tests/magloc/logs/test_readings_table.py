@@ -95,7 +95,7 @@ def test_rows_without_an_attitude_are_left_out(
     expected_s = expected_s[((expected_s < 1.98) | (expected_s > 4.0)) & (expected_s < 9.8)]
     np.testing.assert_allclose(time_s, expected_s, atol=1e-9)
     # 101 rows lie between the attitudes at 1.98 s and 4.00 s; the last row is later than all attitudes.
-    assert "drive.ulg: 102 rows are outside the attitude or in its gaps" in caplog.text
+    assert "drive.ulg: 102 rows lie outside the attitude's times or in its gaps" in caplog.text
 
 
 def test_a_sensor_with_missing_readings_is_proposed(run, tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_a_log_that_is_read_for_its_origin_warns_once(run, tmp_path: Path) -> No
     array_file.write_text("\n".join(line for line in lines if not line.startswith("origin")), encoding="utf-8")
     outcome = run("qc", path, "--array", array_file)
     assert outcome.status == 0
-    assert outcome.err.count("rows are outside the attitude") == 1
+    assert outcome.err.count("rows lie outside the attitude's times") == 1
 
 
 def test_an_attitude_whose_clock_goes_back_is_refused(run, tmp_path: Path) -> None:

@@ -258,14 +258,14 @@ class TestBadInput:
             magloc.survey(field.array, field.readings, shortest_geology_m=0.1)
 
     def test_a_row_far_away(self, caplog: pytest.LogCaptureFixture) -> None:
-        """One row that is a thousand kilometres away is left out."""
+        """One row that is a thousand kilometres away is ignored."""
         field = simulated("survey-drone", 904, 0)
         places = field.readings.array_position_m
         assert places is not None
         wild = places + np.outer(np.arange(len(places)) == 30, [1e6, 1e6, 0.0])
         with caplog.at_level(logging.WARNING):
             found = magloc.survey(field.array, replace(field.readings, array_position_m=wild))
-        assert "spikes in the places: 1" in caplog.text
+        assert "spikes in the positions: 1" in caplog.text
         assert (len(found), len(found.rows.time_s)) == (0, len(places) - 1)
 
     def test_few_rows(self) -> None:

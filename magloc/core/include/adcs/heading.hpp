@@ -14,7 +14,7 @@ constexpr int told_states[4] = {state_heading, state_offset, state_offset + 1, s
 // Beyond this variance of the heading the field tells it alone: it is too far for a linear update.
 constexpr double lost_variance = 0.25;
 
-// How a room's field changes: the part of each state that is left after a block, and the growth of its variance.
+// How a room's field changes: the part of each state that remains after a block, and the growth of its variance.
 template <class Real>
 struct RoomStep {
   const Real *kept, *growth;  // (n_heading)
@@ -173,7 +173,7 @@ struct HeadingFilter {
   }
 };
 
-// The filter over all blocks. A block is left out where it, or the mean of the last ones, contradicts the state. When
+// The filter over all blocks. A block is rejected where it, or the mean of the last ones, contradicts the state. When
 // that goes on for a while, three others run beside the filter from there: one whose sensor's offset changed, one whose
 // room's field did, and one in whose room it is another one everywhere. The first takes over when the blocks speak for
 // it against both others, which only turns can make them do. All end when the filter agrees with its blocks again.

@@ -28,7 +28,7 @@ struct RuntimeStates {
   StatePlaces places;
 };
 
-// Optional states that are chosen when the program is compiled. Of a field gain the first row stands for all three.
+// Optional states that are chosen when the program is compiled. A field gain has three equal rows: the first represents all.
 template <int... chosen>
 constexpr StatePlaces places_of() {
   StatePlaces found = {6, {}};
@@ -52,7 +52,7 @@ constexpr int row_length = (States::most + 3) / 4 * 4;
 template <class Real, class States>
 using Covariance = Real[States::most][row_length<States>];
 
-// What a filter is told once.
+// Constant inputs of a filter.
 template <class Real = double, class States = RuntimeStates>
 struct FilterModel {
   Body<Real> body;
@@ -68,7 +68,7 @@ struct FilterModel {
   int width() const { return (n() + 3) / 4 * 4; }
 };
 
-// What a filter is told of an instant besides the readings.
+// Inputs of a filter at one instant, besides the readings.
 template <class Real = double>
 struct Instant {
   Wheels<Real> wheels;

@@ -1,4 +1,4 @@
-// What a satellite's filter is told, and what it answers.
+// Inputs and outputs of a satellite's filter.
 #pragma once
 #include "adcs/mekf.hpp"
 

@@ -78,7 +78,7 @@ struct Isotropic {
 };
 
 // Any sensors and noise, the same or another in each row: gains of every channel, and orthonormal columns of the common
-// field. Missing channels have no gain. Known parts of the common field are channels of their own behind all others.
+// field. Missing channels have no gain. Known parts of the common field are separate channels behind all others.
 template <class T>
 struct General {
   static constexpr bool linear = true, isotropic = false;

@@ -6,7 +6,7 @@
 #pragma once
 #include <stdint.h>
 
-// All functions of one instruction set live in a namespace of its own. Otherwise the linker merges equal functions that
+// All functions of one instruction set live in a separate namespace. Otherwise the linker merges equal functions that
 // were compiled with different flags, and code for a newer processor reaches an older one.
 #ifndef MAGLOC_ISA
 #define MAGLOC_ISA portable

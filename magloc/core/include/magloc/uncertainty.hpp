@@ -207,7 +207,7 @@ class Uncertainty {
       double along = 0.0;
       for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) along += q[i] * covariance[6 * i + j] * q[j] / s2;
-      // What the solution stands for: range and moment are uniform by their logarithms, the range by one at most.
+      // Prior of the solution: range and moment are uniform by their logarithms, the range by one at most.
       log_volume_[k - offset] = -0.5 * log_volume_[k - offset] + 3.0 * logarithm(variance) -
                                 1.5 * logarithm(rho2 * moment2) - 0.5 * logarithm(maximum(along / (rho2 * rho2), 1.0));
       step_[k - offset] = square_root(maximum(along, 0.0) / rho2) / (1.0 + rho2);

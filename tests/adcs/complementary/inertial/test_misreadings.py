@@ -1,4 +1,4 @@
-"""Logs of inertial units that are misread are named by what they are misread as; right ones are left alone."""
+"""Logs of inertial units that are misread are named by what they are misread as; right ones are not named."""
 
 import numpy as np
 import pytest

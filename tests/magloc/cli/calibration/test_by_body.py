@@ -55,7 +55,7 @@ class TestOutputs:
         assert list(tmp_path.iterdir()) == [tmp_path / "knob.toml"]
         assert "magnet" in done.out
         assert "m3" in done.out
-        assert "cross-validation: rows left out" in done.err
+        assert "cross-validation: rows held out" in done.err
 
     def test_the_figure(self, run: Run, options: list[str], tmp_path: Path) -> None:
         run("calibrate", *options, "--figures", str(tmp_path))
