@@ -16,7 +16,7 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     induced_uncertainty = 1e-4      # optional, induced field of the carrier over the ambient field: 1 sigma
     eddy_uncertainty_s = 1e-4       # optional, field of eddy currents over the ambient field's derivative
 
-    [[sensor]]                      # in place of geometry, its size, and the keys from kind to eddy_uncertainty_s
+    [[sensor]]                      # instead of geometry, its size, and the keys from kind to eddy_uncertainty_s
     id = "s1"
     kind = "vector"
     position_m = [0.0, 0.0, 0.918]  # array frame
@@ -31,7 +31,7 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     drift_nT_rth = 0.1
     induced_uncertainty = 1e-4
     eddy_uncertainty_s = 1e-4
-    noise_fraction = 0.01           # optional, in place of the array's
+    noise_fraction = 0.01           # optional, instead of the array's
     [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
     offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor

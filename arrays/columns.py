@@ -64,7 +64,7 @@ class Track:
     ----------
     path : str
     columns : LogColumns
-        Columns of that file, with `geodetic` or `position`. Its clock is that of the log.
+        Columns of that file, with `geodetic` or `position`. Its clock is the log's.
 
     Examples
     --------
@@ -94,8 +94,8 @@ class LogColumns:
         "s", "ms", "us", "iso" for instants such as 2026-11-21T12:00:00.5 (UTC by default) and times of day such as
         09:14:03.5, "hhmmss" for numbers such as 091403.5, or "rows" for a log without times: one row per second.
     date : str, optional
-        Date of the first row, such as 2026-05-12, for a log with times of day only; without it times count from the
-        midnight before the first row.
+        Date of the first row, such as 2026-05-12, for a log with times of day only; without it times are seconds
+        since the midnight before the first row.
     time_offset_s : float
         Number of seconds to add to the times, such as -18 from the time of GPS to UTC.
     day_first : bool, optional
@@ -108,9 +108,9 @@ class LogColumns:
     position : tuple of 2 or 3 str, optional
         Columns of the array's position [m], in a world frame whose z points up; two with `height_m`.
     geodetic : tuple of 2 or 3 str, optional
-        In place of `position`: columns of latitude, longitude [deg] and, without `height_m`, height [m].
+        Instead of `position`: columns of latitude, longitude [deg] and, without `height_m`, height [m].
     track : Track, optional
-        In place of `position`: another file with the positions.
+        Instead of `position`: another file with the positions.
     crs : str, optional
         Coordinate system, such as "EPSG:32633", of easting and northing in `position`, or of latitude and longitude in
         `geodetic`. The world frame is east, north, up of the origin; convergence and scale of the grid are corrected.
@@ -127,8 +127,8 @@ class LogColumns:
     quaternion : tuple of 4 str, optional
         Columns of the attitude, from the array's frame to the world, x, y, z, w.
     angles : tuple of str, optional
-        In place of `quaternion`: columns of yaw, or of yaw, pitch and roll [deg], from north, east, down to forward,
-        right, down. The array's axes are forward, left, up. Without an attitude they are those of the world.
+        Instead of `quaternion`: columns of yaw, or of yaw, pitch and roll [deg], from north, east, down to forward,
+        right, down. The array's axes are forward, left, up. Without an attitude they are the axes of the world.
     course : bool
         In place of an attitude: the array's x axis points along the course over ground. Files only.
     pose_latency_s : float
@@ -287,7 +287,7 @@ class LogColumns:
 
     @property
     def above_ground(self) -> bool:
-        """True if heights count from the ground."""
+        """True if heights are above the ground."""
         columns = self if self.track is None else self.track.columns
         return columns.height_m is not None or columns.height_is == "ground"
 

@@ -95,7 +95,7 @@ def decorrelated_differences(
 
     ``available`` (C,): channels that have a reading; all by default. ``base``: base sensor among the complete
     sensors of a kind. It changes the differences, never their likelihood. ``covariance_T2`` (C, C): covariance of
-    the channels' noise in place of the array's own [T²], as one of :func:`reading_covariance`: block-diagonal by
+    the channels' noise instead of the array's own [T²], as one of :func:`reading_covariance`: block-diagonal by
     sensor. Entries of channels without a reading are ignored. Returns: with k = channels - rank of the
     common field; k = channels under a prior.
     """

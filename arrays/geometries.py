@@ -35,7 +35,7 @@ def tetrahedron(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------
@@ -66,7 +66,7 @@ def square(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) ->
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------
@@ -93,7 +93,7 @@ def cross(arm_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------
@@ -120,7 +120,7 @@ def cube(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------
@@ -149,7 +149,7 @@ def hexagon(radius_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------
@@ -175,7 +175,7 @@ def axial(baseline_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------
@@ -205,7 +205,7 @@ def grid(nx: int, ny: int, pitch_m: float, kind: SensorKind = "vector", noise_T:
     Returns
     -------
     SensorArray
-        Array centred on the origin, with sensors s1, s2, … whose axes are those of the array.
+        Array centred on the origin, with sensors s1, s2, … whose axes are parallel to the array's.
 
     Examples
     --------

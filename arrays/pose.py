@@ -21,8 +21,8 @@ _BELOW_30 = Rule(lambda value: 0.0 <= value < 30.0, "a number from 0 to below 30
 class PoseUncertainty:
     """Standard deviations of the errors of an array's pose, along or about each axis.
 
-    The true attitude is that of the readings, rotated by a small vector in the array's axes about the reference point
-    of the pose. The true position is that of the readings, moved along the axes of the world. Different clocks make the
+    The true attitude is the stated one, rotated by a small vector in the array's axes about the reference point
+    of the pose. The true position is the stated one, moved along the axes of the world. Different clocks make the
     pose that of another time.
 
     Attributes
@@ -41,7 +41,7 @@ class PoseUncertainty:
         Standard deviation of a constant difference of the clocks.
     lever_arm_m : tuple of 3 floats
         Vector from the reference point of the pose to the origin of the array, in the array's axes; errors of the
-        attitude rotate about the reference point. The pose in the readings is that of the origin.
+        attitude rotate about the reference point. The pose in the readings refers to the origin.
 
     Raises
     ------
@@ -82,7 +82,7 @@ _DEFAULT = PoseUncertainty()
 
 
 class PoseTable(Table, kw_only=True):
-    """The table ``pose`` of an array file; the default constants are those of an ordinary mounting."""
+    """The table ``pose`` of an array file; the default constants describe an ordinary mounting."""
 
     position_m: NotNegative = 0.0
     attitude_deg: Annotated[float, _BELOW_30] = 0.0

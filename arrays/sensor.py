@@ -124,7 +124,7 @@ class Sensor:
     drift_T_rth : float
         Random walk of the offset, per channel: standard deviation after one hour [T/√h].
     noise_fraction : float, optional
-        Noise proportional to the field, in place of the array's: variance = noise² + (fraction · |B|)².
+        Noise proportional to the field, instead of the array's: variance = noise² + (fraction · |B|)².
     induced_uncertainty : float
         Standard deviation of every component of the field that the ambient field induces in the carrier, at the sensor
         in the array's axes, over the ambient field.

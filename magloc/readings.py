@@ -74,7 +74,7 @@ class Readings:
     motion : MeasuredMotion of n, optional
         Measured velocities and rates of array and object.
     pose_sigma : ndarray, shape (n, 2), optional
-        Standard deviations per axis of position [m] and attitude [rad], in place of :class:`arrays.PoseUncertainty`.
+        Standard deviations per axis of position [m] and attitude [rad], instead of :class:`arrays.PoseUncertainty`.
     interpolated_m : ndarray, shape (n,), optional
         Standard deviation along each axis that interpolation between fixes adds to the error of a position [m].
     lines : tuple of (float, str)

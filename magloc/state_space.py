@@ -170,7 +170,7 @@ def iterated_update(
         Tolerance of the stop rule in the unit of z, usually a fraction of the sensors' noise. With 0 all allowed
         linearisations are used.
     max_iterations : int
-        Largest number of linearisations. With 1 the update is that of an extended Kalman filter; with a `tolerance` of
+        Largest number of linearisations. With 1 the update equals an extended Kalman filter's; with a `tolerance` of
         0 it then needs one prediction only.
     shrink : float
         Factor for the length of the steps. It applies each time a step changes the prediction no less than the step

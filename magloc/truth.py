@@ -1,7 +1,7 @@
 """True positions and moments of a source: truth files, and their values at the rows of readings.
 
 A truth file is CSV with ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2][, sigma_m]``, one row per instant. For a
-moment of unknown strength ``axis_x, axis_y, axis_z`` stand in place of the moment. Of a body the file has the attitude
+moment of unknown strength ``axis_x, axis_y, axis_z`` stand instead of the moment. Of a body the file has the attitude
 ``qx, qy, qz, qw`` (scalar last, from the body's frame), and optionally its error ``sigma_deg``.
 """
 

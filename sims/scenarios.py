@@ -28,8 +28,8 @@ def read_scenario(name_or_path: str) -> MagneticScenario | AttitudeScenario:
     Parameters
     ----------
     name_or_path : str
-        Name of a built-in scenario of ``magloc simulate`` or ``adcs run``, or a TOML file of either: with a table
-        ``satellite`` it is of a satellite.
+        Name of a built-in scenario of ``magloc simulate`` or ``adcs run``, or a TOML file of either. A file with a
+        table ``satellite`` describes a satellite.
 
     Returns
     -------

@@ -35,7 +35,7 @@ def calibrate(
     """Calibrate the magnetometer of a log by the field along the orbit.
 
     Estimates gains, axes and bias, and the time shift of the positions. The command names what the log does not
-    determine. The prior is that of the scenario file: noise_nT of the magnetometer, and field_bias_nT, field_gain,
+    determine. The scenario file states the prior: noise_nT of the magnetometer, and field_bias_nT, field_gain,
     field_axes_deg, field_model_error_nT (150 for 0) and field_model_correlation_s of the table estimate.
 
     Parameters
@@ -43,7 +43,7 @@ def calibrate(
     telemetry : Path
         Telemetry (CSV), as for `adcs estimate`.
     config : Path
-        Scenario file (TOML) of the satellite. time_s counts from the start of its orbit.
+        Scenario file (TOML) of the satellite. time_s is in seconds from the start of its orbit.
     attitude : str
         Attitude of the satellite: unknown ("none"), so that only the modulus of each row counts and the mounting of the
         sensor stays unknown, or constant and unknown in the orbital frame ("orbital").
@@ -54,7 +54,7 @@ def calibrate(
     out : Path, optional
         CSV file to write: the log with calibrated readings.
     json : bool
-        Print one JSON object, in place of the text.
+        Print one JSON object, instead of the text.
     common : QuietOptions
         Common options.
     """

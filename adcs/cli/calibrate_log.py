@@ -49,7 +49,7 @@ def calibrate_log(
         File to write: array file of one magnetometer (.toml), or parameters of PX4 (.params) or ArduPilot (.param,
         .parm).
     json : bool
-        Print one JSON object, in place of the table.
+        Print one JSON object, instead of the table.
     common : QuietOptions
         Common options.
     """

@@ -40,7 +40,7 @@ def estimate(
         torquers_x_Am2, with y and z, in body axes. Empty cells and missing rows are missing readings. Or an attitude
         ephemeris message of the CCSDS (.aem).
     config : Path
-        Scenario file (TOML) of the satellite. time_s counts from the start of its orbit. Its table log states other
+        Scenario file (TOML) of the satellite. time_s is from the start of its orbit. Its table log states other
         names of columns, UTC times, units, axes and conventions of quaternions.
     options : EstimateOptions
         Values that replace those of the scenario file.

@@ -35,7 +35,7 @@ def imu(
     is relative to the first row. During gaps σ grows, and the gaps are reported. A log with wrong units or axes is
     refused. --out writes attitude.csv and attitude.png.
 
-    The method is that of D. Laidig and T. Seel (VQF, Information Fusion 91, 2023), with a Kalman filter of the heading
+    The method follows D. Laidig and T. Seel (VQF, Information Fusion 91, 2023), with a Kalman filter of the heading
     that models disturbances of the field.
 
     Parameters

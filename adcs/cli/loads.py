@@ -48,7 +48,7 @@ def loads(
     out : Path, optional
         CSV file to write: the same log without the fields of the loads.
     json : bool
-        Print one JSON object, in place of the text.
+        Print one JSON object, instead of the text.
     common : QuietOptions
         Common options.
     """

@@ -26,7 +26,7 @@ class ReportOptions(QuietOptions):
     out : Path, optional
         Folder for figures and their data; it is created if it does not exist.
     json : bool
-        Print one JSON object, in place of the text.
+        Print one JSON object, instead of the text.
     threads : int
         Largest number of threads; by default all cores. Results do not depend on it.
     quiet : bool

@@ -75,7 +75,7 @@ def stars(
     wcs : Path, optional
         Folder for a FITS header with the world coordinates of each solved photograph, NAME.wcs.
     lens : Path, optional
-        TOML file with the lens of the camera, in place of --scale-arcsec. If it does not exist, it is written, with the
+        TOML file with the lens of the camera, instead of --scale-arcsec. If it does not exist, it is written, with the
         lens of the photograph with most stars.
     report : ReportOptions
         Outputs.

@@ -201,7 +201,7 @@ class AttitudeRows:
 class AttitudeFilter:
     """Attitude of an inertial unit with a magnetometer, one reading at a time, also near magnets.
 
-    The method is that of :func:`adcs.inertial_magnetic_filter` without ``offline``, which runs this filter over a log.
+    :func:`adcs.inertial_magnetic_filter` has the same method without ``offline``, which runs this filter over a log.
     In the first second the unit should rest: it gives the gyro's bias, the direction up and north. After it, an
     estimate uses all readings so far.
 

@@ -37,7 +37,7 @@ LOST, DOUBTED = "heading lost", "heading doubtful"
 """Name of rows in which the heading of an inertial unit is hardly known."""
 LOST_RAD = 0.5
 _RELATIVE = (
-    "there is no magnetometer: the heading is that of gyro and accelerometer alone, relative to the first row, "
+    "there is no magnetometer: the heading is from gyro and accelerometer alone, relative to the first row, "
     "and its σ grows to {:.2g}°"
 )
 _NAMES = ("first vector", "second vector")
@@ -148,7 +148,7 @@ def inertial_magnetic_filter(
     The acceleration is smoothed in a frame that does not rotate, the gyro's bias is measured at rest, and the
     magnetometer's lag is estimated. The field of the first second, in which the unit should rest, defines north. A
     Kalman filter estimates the heading. Its further states are the gyro's scale and drift, the sensor's offset, and the
-    difference of the room's field from that of the start. Without a field the heading is that of the gyro, relative to
+    difference of the room's field from that of the start. Without a field the heading is from the gyro, relative to
     the first row.
 
     Parameters

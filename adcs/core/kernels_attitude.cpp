@@ -62,7 +62,7 @@ inline FilterModel<> model_of(const magloc_mekf &p, const Control<> *feedback) {
   return model;
 }
 
-// row is that of an array (n_runs, n_instants, ...).
+// row is a row of an array (n_runs, n_instants, ...).
 inline Instant<> instant_at(const magloc_mekf &p, int64_t row) {
   return {{vector_at(p.momentum + 3 * row), vector_at(p.wheel_torque + 3 * row)},
           vector_at(p.torquers + 3 * row),

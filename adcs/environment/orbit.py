@@ -21,7 +21,7 @@ from arrays.typing import FloatArray
 MU_M3_S2 = 3.986004418e14
 """Gravitational parameter of the Earth, WGS-84."""
 EARTH_RADIUS_M = 6_378_137.0
-"""Equatorial radius, WGS-84; altitudes of circular orbits count from it."""
+"""Equatorial radius, WGS-84; altitudes of circular orbits are measured from it."""
 WARNED_DAYS, REFUSED_DAYS = 7.0, 30.0
 """Ages of two-line elements from which on there is a warning, and from which on they are refused."""
 _LOG = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ def sun_position_eci(utc: Instants) -> FloatArray:
     """Return the apparent position of the Sun from the Earth's centre in eci [m], with annual aberration.
 
     Shapes ``utc`` (...) -> (..., 3). The accuracy is some arc seconds from 1900 to 2100 (erfa's series of the Earth's
-    orbit, with TT in place of TDB).
+    orbit, with TT instead of TDB).
     """
     heliocentric, barycentric = pyerfa().epv00(*terrestrial_dates(utc))
     distance = np.linalg.norm(heliocentric["p"], axis=-1)

@@ -1,6 +1,6 @@
 """Orbit and attitude messages of the CCSDS: OEM (502.0-B) and AEM (504.0-B), as text with keywords.
 
-An attitude is that of a body against an inertial frame. With ``ATTITUDE_DIR = A2B`` and A inertial, the matrix of the
+An attitude relates a body to an inertial frame. With ``ATTITUDE_DIR = A2B`` and A inertial, the matrix of the
 message's quaternion transforms components from A to B. As a Hamilton quaternion it is the rotation, inertial from body,
 that :mod:`adcs` uses.
 """

@@ -71,7 +71,7 @@ class ImuStream:
                 raise InputError(f"{stream.name}: found {found}, expected {_EXPECTED}.")
 
     def parse(self, lines: Sequence[bytes], name: str) -> Iterator[AttitudeEstimate]:
-        """Yield the estimates of the next lines; ``name`` is that of the stream in errors."""
+        """Yield the estimates of the next lines; ``name`` names the stream in errors."""
         for line in lines:
             self._n_lines += 1
             try:

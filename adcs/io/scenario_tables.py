@@ -94,7 +94,7 @@ class DisturbanceTable(Table, kw_only=True):
 
 
 class StarTrackerTable(Table, kw_only=True):
-    """Table of the star tracker; its noise is that of the angle about each axis."""
+    """Table of the star tracker; its noise is stated for the angle about each axis."""
 
     noise_deg: Positive = 0.001
     rate_limit_deg_s: Positive = 2.0
@@ -116,7 +116,7 @@ class StarTrackerTable(Table, kw_only=True):
 
 
 class GyroTable(Table, kw_only=True):
-    """Table of the gyro; its noise is that of one reading of one axis."""
+    """Table of the gyro; its noise is stated for one reading of one axis."""
 
     noise_deg_s: Positive = 0.005
     range_deg_s: Positive = 250.0
@@ -134,7 +134,7 @@ class GyroTable(Table, kw_only=True):
 
 
 class MagnetometerTable(Table, kw_only=True):
-    """Table of the magnetometer; its noise is that of one reading of one axis."""
+    """Table of the magnetometer; its noise is stated for one reading of one axis."""
 
     noise_nT: Positive = 250.0
     range_nT: Positive = 200_000.0
@@ -152,7 +152,7 @@ class MagnetometerTable(Table, kw_only=True):
 
 
 class SunSensorTable(Table, kw_only=True):
-    """Table of the Sun sensor; its noise is that of the direction along each of two axes across it."""
+    """Table of the Sun sensor; its noise is stated for each of two axes across the direction."""
 
     noise_deg: Positive = 0.1
     half_field_deg: Positive = 45.0

@@ -170,7 +170,7 @@ class FilterSettings:
         Process noise of a usual step.
     field_error_T : float
         Standard deviation of each component of the field model's error. It is added to the magnetometer's noise, or is
-        that of the state ``field-model``, with :data:`FIELD_ERROR_T` in place of 0.
+        that of the state ``field-model``, with :data:`FIELD_ERROR_T` instead of 0.
     field_correlation_s : float
         Time constant of the state ``field-model``; 1,000 km of a low orbit.
     disturbance_correlation_s : float

@@ -134,7 +134,7 @@ def refuse_unplaced(path: Path, log: VehicleLog) -> None:
     if path.suffix.lower() == ".toml" and len(log.magnetometers) > 1:
         found = f"found {len(log.magnetometers)} magnetometers, whose places the log does not state"
         raise InputError(
-            f"--out: {found}, expected .params (PX4), .param or .parm (ArduPilot) in place of an array file."
+            f"--out: {found}, expected .params (PX4), .param or .parm (ArduPilot) instead of an array file."
         )
 
 

@@ -48,7 +48,7 @@ class FieldPrior:
 
     @property
     def is_known(self) -> bool:
-        """True if the field is that of a place."""
+        """True if the field is known from the place."""
         return self.modulus_sigma < PRIOR_MODULUS
 
 

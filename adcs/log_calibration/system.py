@@ -270,7 +270,7 @@ class Estimate:
     def gyro_turns(self) -> tuple[FloatArray, FloatArray]:
         """Return rotations by unit errors of the gyro's bias and of its matrix, world frame.
 
-        The first ones (K - 1, 3, 9) are those of whole intervals. The second ones (n, 3, 9) are those of each instant
+        The first ones (K - 1, 3, 9) belong to whole intervals. The second ones (n, 3, 9) belong to each instant
         that are not linear within its interval.
         """
         data = self.problem.inertial
@@ -295,7 +295,7 @@ class Estimate:
 
     @cached_property
     def thrust(self) -> FloatArray:
-        """Direction (K - 1, 3) of the thrust, which is that of the mean specific force in body axes, world frame."""
+        """Direction (K - 1, 3) of the thrust in the world frame: the direction of the mean specific force."""
         mean = self.problem.inertial.acceleration_m_s2.mean(axis=0)
         return np.asarray(self.mean_force[2] @ (mean / np.linalg.norm(mean)))
 

@@ -15,7 +15,7 @@ _MOST_POINTS = 4000
 def log_calibration_figure(found: LogCalibration) -> Figure:
     """Draw the modulus of each magnetometer before and after its calibration; shades are excluded parts.
 
-    Without any error the modulus is that of the Earth's field, the dashed line.
+    Without any error the modulus equals the Earth's field, the dashed line.
     """
     estimate = found.fit.estimate
     data, M = estimate.problem.inertial, len(estimate.rows)

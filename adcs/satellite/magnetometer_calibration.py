@@ -108,7 +108,7 @@ class MagnetometerCalibration(Drawn):
     gain : ndarray, shape (3, 3)
         Gains and misalignments D.
     time_shift_s : float
-        Time shift of the model: the field at a row is that of the model at this later time.
+        Time shift of the model: the field at a row is the model's at this later time.
     covariance : ndarray, shape (13, 13)
         Posterior covariance of :data:`NAMES`.
     prior : MagnetometerPrior

@@ -32,7 +32,7 @@ class Satellite:
     control : WheelControl
         Wheel control, used by simulations and by the Jacobian of the closed loop.
     start : datetime64
-        UTC from which times of the telemetry count; by default the orbit's epoch.
+        UTC of time zero of the telemetry; by default the orbit's epoch.
     field_model : str or Coefficients
         Model of the geomagnetic field: "IGRF-14" (1900 to 2030) or "WMM2025".
     body : RigidBody

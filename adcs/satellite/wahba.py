@@ -57,7 +57,7 @@ def attitude_of_vectors(
 
     ``quest`` minimises :math:`\sum |b_k - A^T r_k|^2 / \sigma_k^2` of unit vectors by the largest eigenvalue of
     Davenport's matrix. Its covariance is :math:`(\sum (E - b_k b_k^T)/\sigma_k^2)^{-1}`. ``triad`` takes the direction
-    of the first vector as exact and uses the second one for the rotation about it. Its covariance is that of Shuster
+    of the first vector as exact and uses the second one for the rotation about it. Its covariance is given by Shuster
     and Oh.
 
     Parameters

@@ -305,7 +305,7 @@ class StarMatcher:
         axis = -pose.R_catalogue_from_frame[:, 2]
         around = self.catalogue.tree.query_ball_point(axis, radius, return_length=True)
         covered = float(np.asarray(around)) * (self.gate_rad(pose.camera) / radius) ** 2
-        # At least `matched` - 3 matches; the survival function is that of more than its argument.
+        # At least `matched` - 3 matches; the survival function is the probability of more than its argument.
         return np.asarray(binom.logsf(matched - 4, np.maximum(stars - 3, 0), min(covered, 1.0)))
 
 

@@ -1,6 +1,6 @@
 """Stars in photographs of the sky: reading of pictures, and detection of lights above the background.
 
-The sky glows unevenly, and a lens is darker at its corners. So background and noise are those of a neighbourhood, not
+The sky glows unevenly, and a lens is darker at its corners. So background and noise are of a neighbourhood, not
 of the whole picture.
 """
 

@@ -63,7 +63,7 @@ def solve_photograph(
         Part of the sky in which the picture's centre is, such as ``adcs.stars.catalogue.SkyCap.of(ra_rad, dec_rad,
         radius_rad)``; by default the whole sky.
     lens : KnownLens, optional
-        Lens of the camera, such as from ``adcs.stars.lens.read_lens``, in place of ``rad_per_px``.
+        Lens of the camera, such as from ``adcs.stars.lens.read_lens``, instead of ``rad_per_px``.
     dark : array_like, shape (height, width), optional
         Picture of the camera without light, which is subtracted.
     last : StarFix, optional
@@ -132,7 +132,7 @@ def identify_at_unknown_scale(
     ``rad_per_px``: scale at the centre with the relative error ``tolerance``, at most 0.1; by default fields of 3 to
     100° from corner to corner are tried, the widest with an equidistant lens. ``noise_px``: standard deviation of a
     star's place, with errors of the lens. ``near``: part of the sky in which the picture's centre is. ``lens``: known
-    lens, in place of ``rad_per_px``. ``last``: fix of the picture before, see :func:`solve_photograph`.
+    lens, instead of ``rad_per_px``. ``last``: fix of the picture before, see :func:`solve_photograph`.
     """
     check_positive(tolerance=tolerance, noise_px=noise_px)
     if tolerance > _WIDEST_TOLERANCE:

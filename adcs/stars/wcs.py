@@ -25,8 +25,8 @@ _ZPN_POWERS = 20  # limit of the powers of a polynomial by the standard
 def wcs_header(fix: StarFix) -> str:
     """Return the FITS header of the world coordinates of a solved photograph.
 
-    The frame is that of the catalogue, for Hipparcos the ICRS. The projection is TAN without, and TAN-SIP with a
-    distortion of a pinhole, ZPN for an equidistant lens. In a mirrored picture x is that of the file.
+    The frame is the catalogue's, for Hipparcos the ICRS. The projection is TAN without, and TAN-SIP with a
+    distortion of a pinhole, ZPN for an equidistant lens. In a mirrored picture x is as in the file.
     """
     camera, R = fix.pose.camera, fix.R_catalogue_from_frame
     scale = math.tan(camera.rad_per_px)

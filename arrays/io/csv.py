@@ -358,7 +358,7 @@ def _check_header(place: str, cells: Sequence[str], expected: str, separator: st
     seen: set[str] = set()
     for position, name in enumerate(header, start=1):
         if is_number_or_empty(name):
-            found = f"{name!r} in place of a name" if name else "no name"
+            found = f"{name!r} instead of a name" if name else "no name"
             raise InputError(f"{place}, column {position}: found {found}, expected {expected}.")
         if name in seen:
             raise InputError(f"{place}, column {_short_name(name)}: found a second time, expected once.")

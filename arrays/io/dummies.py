@@ -1,4 +1,4 @@
-"""Dummy values: numbers in place of missing readings, such as -99999, 1e32, or 0 beside 48,000."""
+"""Dummy values: numbers instead of missing readings, such as -99999, 1e32, or 0 beside 48,000."""
 
 from __future__ import annotations
 

@@ -266,7 +266,7 @@ def _with_tables_in(hint: Any) -> Any:
 
 
 def _with_tables(place: str, struct: type[Table], key: str, value: Any, type_: Any) -> Any:
-    """Return a value with structs in place of its tables; a later check refuses other types."""
+    """Return a value with structs instead of its tables; a later check refuses other types."""
     container = get_origin(type_) or type_
     if container is list and isinstance(value, list):
         (table,) = get_args(type_)

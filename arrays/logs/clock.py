@@ -108,7 +108,7 @@ def seconds_of_rows(table: Table, columns: LogColumns, *, is_file: bool) -> Floa
 
 
 def date_of(time_s: float) -> str | None:
-    """Return the date of an instant (UTC), such as 2026-05-12; None for times that count from elsewhere."""
+    """Return the date of an instant (UTC), such as 2026-05-12; None for times with another origin."""
     if not time_s > _FIRST_DATE_S:
         return None
     return datetime.datetime.fromtimestamp(time_s, datetime.UTC).date().isoformat()

@@ -278,7 +278,7 @@ READINGS_FILE = LogFormat({}, None, "", ())
 def without_dummies(
     table: Table, form: LogFormat, name: Callable[[str, int], None] | None = None, before: FloatArray | None = None
 ) -> Table:
-    """Return a table of readings with NaN in place of dummy values, and report their numbers.
+    """Return a table of readings with NaN instead of dummy values, and report their numbers.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class Proposal:
     header_line : int
         Line of the header.
     about : str
-        Sentence about a log without lines, in place of that about the header.
+        Sentence about a log without lines, instead of that about the header.
     sensor_lines : tuple of str
         Further lines of the table of each sensor.
     noise_lines : dict

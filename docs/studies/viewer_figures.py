@@ -1,6 +1,6 @@
 """How long a page of the viewer takes in the browser: ``python -m docs.studies.viewer_figures``.
 
-Times of the page are those of its main thread, in processor time, and of the whole way to the words that it shows. A
+Times of the page are processor times of its main thread, and the whole time until its text appears. A
 machine without a graphics card draws in software, on the same processors; frames are counted beside it.
 """
 

@@ -235,7 +235,7 @@ class MagnetBody:
     def moment_root(self) -> FloatArray:
         """Square root (K, q) of the covariance of relative errors of the moments; q is 0 for exact moments.
 
-        The first columns are those of single magnets, the last one is the temperature that all of them share.
+        The first columns belong to single magnets, the last one to the temperature that all of them share.
         """
         own = np.array([magnet.relative_sigma for magnet in self.magnets])
         columns = np.diag(own)[:, own > 0.0]
@@ -247,6 +247,6 @@ class MagnetBody:
         return self.magnets[:index] + self.magnets[index + 1 :]
 
     def as_dipoles(self) -> MagnetBody:
-        """Return the body with a dipole in place of every shape."""
+        """Return the body with a dipole instead of every shape."""
         magnets = tuple(replace(magnet, shape=None, rotation_xyzw=None) for magnet in self.magnets)
         return replace(self, magnets=magnets)

@@ -97,7 +97,7 @@ def _shape_fields(
 
 
 def body_fields(body: MagnetBody, points_m: FloatArray, position_m: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the field (..., N, 3) [T] of a body; arguments are those of :func:`magnet_fields`."""
+    """Return the field (..., N, 3) [T] of a body; for the arguments see :func:`magnet_fields`."""
     return np.asarray(magnet_fields(body, points_m, position_m, R).field_T.sum(axis=-3))
 
 

@@ -257,7 +257,7 @@ class BodyLocator:
         return poses
 
     def _within_limits(self, optima: RowOptima, dof: int) -> BoolArray:
-        """Return whether optima (b, W) lie within the limits of the body, or three standard deviations beside them."""
+        """Return whether optima (b, W) lie in the limits of the body, or at most three standard deviations outside."""
         limits = self.body.limits
         variance = np.diagonal(optima.covariance, axis1=-2, axis2=-1)
         factor = np.fmax(optima.chi2 / max(dof, 1), 1.0)[..., None]
@@ -394,7 +394,7 @@ def locate_body(
     readings : Readings or array_like, shape (n, C) or (C,)
         Raw readings [T], NaN where missing. The pose of a moving array is not used: poses are in the array's frame.
     ambient_T : array_like, shape (n, 3) or (3,), optional
-        Ambient field in the array's frame [T], in place of that of the readings or the array.
+        Ambient field in the array's frame [T], instead of that of the readings or the array.
     progress : callable, optional
         Called with the number of rows finished since the last call.
 

@@ -41,7 +41,7 @@ class Bounds(Drawn):
     range_m : ndarray, shape (...)
         Distance of the source from the sensors' centroid.
     covariance : ndarray, shape (..., 6, 6)
-        Covariance of (p, m) [m, A·m²]. A parameter that is not estimable has an infinite variance and NaN beside it.
+        Covariance of (p, m) [m, A·m²]. Parameters that are not estimable have an infinite variance and NaN covariances.
     sigma_range_m : ndarray, shape (...)
         σ along the line from the centroid to the source.
     sigma_bearing_rad : ndarray, shape (...)
@@ -101,7 +101,7 @@ def nuisance_free_jacobian(
 
     A known modulus of the moment adds one row.
 
-    Columns (p, m) in 1/m and 1/(A·m²); NaN for a source on a sensor. Parameters are those of :func:`cramer_rao_bounds`.
+    Columns (p, m) in 1/m and 1/(A·m²); NaN for a source on a sensor. For the parameters see :func:`cramer_rao_bounds`.
     """
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
@@ -151,7 +151,7 @@ def cramer_rao_bounds(
     Parameters
     ----------
     array : SensorArray
-        Array with its noise and uncertainties. With an uncertain pose the bounds are those of a source in the world,
+        Array with its noise and uncertainties. With an uncertain pose the bounds are for a source in the world,
         in the axes of the stated pose. The array does not move, so clock errors have no effect.
     position_m, moment_Am2 : array_like, shape (..., 3)
         Position [m] and moment [A·m²] of the source in the array's frame.

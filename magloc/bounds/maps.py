@@ -67,7 +67,7 @@ class BoundScenario:
     array : SensorArray
         Array of any sensors.
     moment_Am2 : tuple of 3 floats
-        Moment of the source; its size is that of the moments of other directions, too.
+        Moment of the source; moments of other directions have the same size.
     half_width_m : float
         The cube and the planes reach from -half_width to +half_width along every axis, around the array's centroid.
     accuracy_m : float
@@ -232,7 +232,7 @@ def bound_map(
     array : SensorArray
         Array with its noise and uncertainties.
     moment_Am2 : tuple of 3 floats
-        Moment of the source; its size is that of the moments of other directions, too [A·m²].
+        Moment of the source; moments of other directions have the same size [A·m²].
     edge_m : float
         Edge of the cube, which is centred on the array's centroid [m].
     n : int
@@ -256,7 +256,7 @@ def bound_map(
     Returns
     -------
     xarray.Dataset
-        Dimensions are the source's (x, y, z) relative to the centroid [m]. Variables are those of :func:`bounds_at`,
+        Dimensions are the source's (x, y, z) relative to the centroid [m]. Variables are as in :func:`bounds_at`,
         and ``reached``: for which moments σ of the range is as small as required.
 
     Raises

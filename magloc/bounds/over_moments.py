@@ -57,7 +57,7 @@ def bounds_over_moments(
 
     They are mean, median, 95 % quantile and worst.
 
-    The other parameters are those of :func:`magloc.bounds.crlb.cramer_rao_bounds`.
+    For the other parameters see :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     """
     table = sigma_table(
         array,

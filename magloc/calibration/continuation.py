@@ -86,7 +86,7 @@ def with_common_moment(problem: CalibrationProblem, state: CalibrationState) -> 
 
 
 def relocate(problem: CalibrationProblem, state: CalibrationState, rows: BoolArray, share: float) -> CalibrationState:
-    """Fix some rows again and take the solutions whose moment is nearest to the median."""
+    """Locate some rows again and take the solutions whose moment is nearest to the median."""
     median = np.median(state.moment_Am2, axis=0)
     position, moment = state.position_m.copy(), state.moment_Am2.copy()
     locator = Locator(inflate_field_noise(problem, state.sensors, share), body_length_m=0.0, exclude_faulty=False)

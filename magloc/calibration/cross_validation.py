@@ -66,7 +66,7 @@ def leave_poses_out(
 ) -> CrossValidation | None:
     """Return the errors of rows located with a calibration on the other rows.
 
-    Parameters are those of :func:`magloc.calibrate`. None if rows are too few, or a calibration without some rows
+    For the parameters see :func:`magloc.calibrate`. None if rows are too few, or a calibration without some rows
     fails.
     """
     in_readings, in_truth = rows_of_same_time(readings, truth)

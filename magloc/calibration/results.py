@@ -143,7 +143,7 @@ def residual_rms(
 ) -> FloatArray:
     """Return the residual RMS (N,) of the sensors [T].
 
-    The residuals are those of a known source and the common field that fits best.
+    The residuals are from a known source and the common field that fits best.
     """
     fields = dipole.field(array.positions, position_m[:, None], moment_Am2[:, None])
     residual = readings_T - array.readings_of(fields)

@@ -92,7 +92,7 @@ class SensorProblem(ABC, Generic[State]):
     @property
     @abstractmethod
     def n_globals(self) -> int:
-        """Number of unknowns that all rows share, beside those of the sensors."""
+        """Number of unknowns that all rows share, besides those of the sensors."""
 
     @property
     @abstractmethod

@@ -47,16 +47,16 @@ _FRAMES = 24
 @Parameter(name="*", group="Array and source")
 @dataclass(frozen=True)
 class SourceOptions:
-    """Array and source, in place of those of the scenario.
+    """Array and source, instead of those of the scenario.
 
     Parameters
     ----------
     array : Path
-        Array file (TOML), in place of the scenario's array.
+        Array file (TOML), instead of the scenario's array.
     position : tuple of 3 floats
-        Position of the source [m], in the array's frame, in place of the scenario's.
+        Position of the source [m], in the array's frame, instead of the scenario's.
     moment_Am2 : tuple of 3 floats
-        Moment of the source [A·m²], in place of the scenario's.
+        Moment of the source [A·m²], instead of the scenario's.
     ambient_uncertainty_nT : float
         Standard deviation per axis [nT] of the ambient field in the array file. It matters for scalar sensors.
     known_moment_sigma_Am2 : float

@@ -62,7 +62,7 @@ def design(
     json : bool
         Print one JSON object with the array and the comparison.
     counts : list of int
-        Numbers of sensors, in place of the task's. Writes one array each, NAME-NUMBER.toml, and shows the gain of more
+        Numbers of sensors, instead of the task's. Writes one array each, NAME-NUMBER.toml, and shows the gain of more
         sensors.
     array : Path
         Array file (TOML) of the sensors about the body.

@@ -267,7 +267,7 @@ def _unknown_command(app: App, error: UnknownCommandError) -> str:
 
 
 def use_docstrings(app: App, tokens: Sequence[str]) -> None:
-    """Use the docstring of a command as its help, in place of the line in the list of commands."""
+    """Use the docstring of a command as its help, instead of the line in the list of commands."""
     chain, apps, _ = app.parse_commands(tokens)
     for name, command in zip(chain, apps[1:], strict=True):
         if not name.startswith("-") and all(inner.startswith("-") for inner in command):

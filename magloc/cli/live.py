@@ -37,7 +37,7 @@ class TurningOptions:
     Parameters
     ----------
     calibrate : bool
-        Calibrate in place of tracking: a JSON line a second with the directions covered, the turn that is missing and
+        Calibrate instead of tracking: a JSON line a second with the directions covered, the turn that is missing and
         the standard deviations. It ends when they are enough, and writes --out-array.
     out_array : Path, optional
         Array file to write with the calibrations.
@@ -127,7 +127,7 @@ def live(
     body : Path, optional
         Body file (TOML) of a rigid body of two or more magnets; its pose is tracked, in the array's frame.
     turning : TurningOptions
-        Calibration in place of tracking.
+        Calibration instead of tracking.
     page : PageOptions
         Page that shows the source.
     known : KnownOptions

@@ -109,7 +109,7 @@ def locate(
         Folder for figures and their data: fixes with 95 % ellipses, standard deviations, χ² with its bounds, and the
         residuals of every sensor.
     json : bool
-        Print one JSON object with all solutions, in place of the table.
+        Print one JSON object with all solutions, instead of the table.
     common : CommonOptions
         Common options.
     """

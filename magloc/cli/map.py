@@ -65,7 +65,7 @@ def map_(
     noise : bool
         Over starts: add noise of the sensors, drawn with --seed, to the noise-free readings.
     body_length_m : float
-        Over sources: length of every source [m], in place of the scenario's. The part of its field that a dipole does
+        Over sources: length of every source [m], instead of the scenario's. The part of its field that a dipole does
         not describe counts as noise. By default a quarter of its distance near the array. 0 for point sources.
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT), whose workers then compute the map.

@@ -42,7 +42,7 @@ _LOG = logging.getLogger(__name__)
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
 
 STREAM = "-"
-"""Name of standard input in place of a file."""
+"""Name of standard input instead of a file."""
 
 
 def number_of_sources(sources: str) -> int | Literal["auto"]:
@@ -275,7 +275,7 @@ class KnownOptions:
     def on_earth(self, array: SensorArray, log: Path) -> tuple[SensorArray, KnownOptions]:
         """Return the array with an origin of its places on the Earth, and options that know place and date.
 
-        The origin is that of the array file or of --place, or else the first place of the log, which a note names. The
+        The origin comes from the array file or --place, or else is the first place of the log, which a note names. The
         date of the log or of the array file is used if nothing else gives the ambient field.
         """
         columns = array.columns
@@ -347,9 +347,9 @@ class LogOptions:
     array : Path
         Array file (TOML). Beside --instrument it needs only the keys that differ from the template.
     instrument : str
-        Instrument that wrote the log, such as magarrow or gsm19, in place of --array. An unknown name lists all.
+        Instrument that wrote the log, such as magarrow or gsm19, instead of --array. An unknown name lists all.
     positions : Path
-        Positions of the log in another file, in place of its own: a solution of RTKLIB or Emlid (.pos).
+        Positions of the log in another file, instead of its own: a solution of RTKLIB or Emlid (.pos).
     """
 
     array: Path | None = None

@@ -189,7 +189,7 @@ def track(
     smooth : bool
         Also use later rows (fixed-interval smoother).
     json : bool
-        Print one JSON object in place of the table.
+        Print one JSON object instead of the table.
     jsonl : bool
         Print one JSON line for every row, as soon as it is known.
     known : KnownOptions

@@ -154,7 +154,7 @@ def ambient_at(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the ambient field and the rate of its turning (n, 3) in the platform's axes.
 
-    The modulus (n,) is that of the readings without the platform; its fast changes are noise and sources.
+    The modulus (n,) is from the readings without the platform; its fast changes are noise and sources.
     """
     unit, turning = attitude.at(time_s + lag_s)
     slow = smooth_in_stretches(time_s, modulus_T, _SLOW_S)[:, None]

@@ -43,7 +43,7 @@ def compensate(
     array : SensorArray
         Sensors with their noise and the priors of their platform.
     readings : Readings
-        Log to correct. The attitude is that of the vector sensor with the least noise, or of the pose, which needs the
+        Log to correct. The attitude is by the vector sensor with the least noise, or by the pose, which needs the
         ambient field of every row.
     calibration : Readings, optional
         Log of a calibration flight that the coefficients are fitted to; by default the log itself.
@@ -180,7 +180,7 @@ def _correction(
 
 
 def _between(coarse_s: FloatArray, values: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Return values (k, m) at some times, interpolated to others; NaN beside unknown ones."""
+    """Return values (k, m) at some times, interpolated to others; NaN for unknown ones."""
     if len(coarse_s) == len(time_s):
         return values
     known = np.isfinite(values).all(axis=1)

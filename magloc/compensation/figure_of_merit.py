@@ -35,7 +35,7 @@ class Manoeuvres:
     ----------
     time_s : ndarray, shape (n,)
     cell : ndarray of int, shape (n,)
-        Heading times 3 plus axis; -1 beside manoeuvres.
+        Heading times 3 plus axis; -1 outside manoeuvres.
     """
 
     time_s: FloatArray

@@ -76,7 +76,7 @@ class CalibrationRows:
     time_s, modulus_T : ndarray, shape (n,)
     attitude : Attitude
     is_own : bool
-        True if the attitude is that of the same sensor.
+        True if the attitude comes from the same sensor.
     currents : Signal, optional
     place_m : ndarray, shape (n, 3), optional
     noise_T : float

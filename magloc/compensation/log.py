@@ -62,7 +62,7 @@ class PlatformLog:
 
     @classmethod
     def of(cls, array: SensorArray, readings: Readings, currents: FloatArray) -> PlatformLog:
-        """Return the log of readings in order of time, and of currents (n, K) that count from some mean."""
+        """Return the log of readings in order of time, and of currents (n, K) relative to a mean."""
         check_magnitudes(array)
         if len(readings) < FEWEST_ROWS:
             raise ValueError(f"Input readings must have {FEWEST_ROWS} rows or more; instead received {len(readings)}.")
@@ -90,7 +90,7 @@ class PlatformLog:
         return cls(array, readings, signals, factors, flowing, jumps, left_out)
 
     def noise_T(self, sensor: Sensor) -> float:
-        """Return the noise of a sensor in the scalar sensors' unit: as stated, or as read from row to row if larger."""
+        """Return the noise of a sensor in the scalar sensors' unit: stated, or that of the readings if larger."""
         own = self.readings.values_T[:, self.array.channel_sensor == self.array.ids.index(sensor.id)]
         read = float(white_noise(self.readings.time_s, own).max(initial=0.0))
         return max(sensor.noise_T, read) / self.factors.get(sensor.id, 1.0)

@@ -94,7 +94,7 @@ class ScaledDifferences(NamedTuple):
     ) -> ScaledDifferences:
         """Return the differences as contrasts if their noise allows it.
 
-        Arguments are those of :meth:`from_weights`.
+        For the arguments see :meth:`from_weights`.
         """
         base, noise = _base_and_noise(weights, variance)
         if noise is None:

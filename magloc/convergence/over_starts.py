@@ -66,7 +66,7 @@ class StartStatus(IntEnum):
 class StartsScenario:
     """One source in front of an array, and a cube of starts around it.
 
-    The defaults are those of the paper's figure, with our values where the paper gives none.
+    The defaults are from the paper's figure, with our values where the paper gives none.
 
     Attributes
     ----------
@@ -273,7 +273,7 @@ def convergence_map(
     array : SensorArray
         Vector sensors.
     source : Source
-        Its position and moment count.
+        Only its position and moment are used.
     method : str or Filter
         "repeated", "iekf", "damped" or "global" with their default settings, or a filter of
         :mod:`magloc.convergence.filters`.

@@ -1,13 +1,13 @@
 r"""Optimisation of the magnets of a body, and of the sensors about them, for the bound of the body's pose.
 
-The bound of a pose is that of :func:`magloc.bounds.bodies.body_bounds`. Its two figures become one length,
+:func:`magloc.bounds.bodies.body_bounds` bounds a pose. Its two figures become one length,
 
 .. math:: σ = \sqrt{σ_x^2 + (L σ_θ)^2},
 
 with the largest standard deviation σ_x of the position along any direction, the largest one σ_θ of the rotation about
 any axis, and a lever L: the rotation counts as the displacement of a point at the distance L. The criterion is a
 quantile or the mean of σ over the limits of the body. Shapes and stated errors of magnets and sensors count as in
-``magloc bounds --body``, so the slope of the criterion is by central differences. The descent is that of arrays.
+``magloc bounds --body``, so the slope of the criterion is by central differences. The descent is as for arrays.
 """
 
 from __future__ import annotations

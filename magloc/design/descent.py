@@ -1,6 +1,6 @@
 """Descent of a design criterion over points, such as sensors within a volume or on a surface.
 
-The criterion is that of a fixed sample of sources or poses. Steps are those of a spectral projected gradient. The
+The criterion is evaluated on a fixed sample of sources or poses. Steps follow a spectral projected gradient. The
 change of the gradient in the last step gives the length. The step is projected into the volume, and shortened until the
 criterion is below the worst of the last few values.
 

@@ -40,7 +40,7 @@ class MatchedFilterDetector:
     threshold : float
         Energy [1] above which a source is reported.
     threshold_error : float
-        Standard error of the threshold, from the order statistics beside it.
+        Standard error of the threshold, from the neighbouring order statistics.
     false_alarm_rate : float
         Share of rows of noise alone whose energy is larger.
     seed : int

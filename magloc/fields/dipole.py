@@ -312,7 +312,7 @@ def _direction_and_distance(points: ArrayLike, source: ArrayLike) -> tuple[Array
 def _unit(vectors: Array) -> tuple[Array, Array]:
     """Return directions (..., 3) and lengths (..., 1) of vectors; both are NaN for a vector of length zero."""
     lengths = np.sqrt(_dot(vectors, vectors))[..., None]
-    # NaN in place of zero spreads quietly through the arithmetic that follows; 0/0 would warn.
+    # NaN instead of zero spreads quietly through the arithmetic that follows; 0/0 would warn.
     lengths = np.where(lengths > 0.0, lengths, np.nan)
     return vectors / lengths, lengths
 

@@ -82,7 +82,7 @@ def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: i
         n = x / r
     factors, tensors = _contractions(rank)
     powers = [n[of] for of in factors]
-    # Tensors contracted with n but for one index, and with the moment in place of one n.
+    # Tensors contracted with n but for one index, and with the moment instead of one n.
     vector = (tensors @ prod(powers)).reshape(3, 2 * rank + 1, r.size)
     places = range(len(factors))
     once = sum(prod([m[factors[i]] if i == at else powers[i] for i in places]) for at in places)

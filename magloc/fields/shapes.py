@@ -147,7 +147,7 @@ def shape_jacobians(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the field of a magnet and its Jacobians, by the point (..., 3, 3) and by the moment (..., 3, 3).
 
-    Parameters and errors are those of :func:`shape_fields`. Both Jacobians are symmetric and traceless.
+    For parameters and errors see :func:`shape_fields`. Both Jacobians are symmetric and traceless.
     """
     field, by_point, by_moment = fields_or_nan(shape, points_m, moment_Am2)
     given = np.isfinite(np.broadcast_to(points_m, field.shape)) & np.isfinite(np.broadcast_to(moment_Am2, field.shape))

@@ -276,7 +276,7 @@ def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[st
 def _check_stated_size(array: Any, file: Path) -> None:
     """Raise ValueError if a chunk compressed by zstd states a wrong size; the decoder would allocate it.
 
-    The layout of the first bytes is that of RFC 8878, section 3.1.1.1.
+    RFC 8878, section 3.1.1.1, defines the layout of the first bytes.
     """
     if not file.is_file():  # a folder, or no chunk yet
         return
@@ -290,7 +290,7 @@ def _check_stated_size(array: Any, file: Path) -> None:
     stated = int.from_bytes(head[begin : begin + width], "little") + (256 if width == 2 else 0)
     expected = math.prod(array.chunks) * array.dtype.itemsize
     if width and stated != expected:
-        raise ValueError(f"it states {stated} bytes in place of {expected}")
+        raise ValueError(f"it states {stated} bytes instead of {expected}")
 
 
 def _edge(arrays: Mapping[str, Any], marks: FloatArray, path: Path) -> int:
@@ -305,7 +305,7 @@ def _in_words(key: str, found: Any, wanted: Any) -> str:
     if any(isinstance(value, str) and "\n" in value for value in (found, wanted)):
         return f"another {key}"
     shown = ["none" if value is None else f"{value}" for value in (found, wanted)]
-    return f"{key} {shown[0]} in place of {shown[1]}"
+    return f"{key} {shown[0]} instead of {shown[1]}"
 
 
 def _readable_marks(marks: Any) -> FloatArray:

@@ -50,7 +50,7 @@ def workers(processes: int, scheduler: str | None, folder: Path | None) -> Itera
     Results are cached in a folder. Work whose result is there is not done again, unless other code computed it.
     """
     if folder is not None and (older := [path for path in folder.glob("*.npz") if _code() not in path.name]):
-        _LOG.warning(f"{folder}: {len(older)} finished parts are of another version of magloc, and are computed again")
+        _LOG.warning(f"{folder}: {len(older)} finished parts are of another version of magloc and are computed again")
     with ExitStack() as stack:
         run = runner(scheduler)
         if scheduler is None and processes > 1:

@@ -61,7 +61,7 @@ def without_pose(body: MagnetBody, rows: Sequence[Row], status: str) -> list[Bod
 def magnet_points(body: MagnetBody, poses: BodyPoses) -> dict[int, tuple[SourcePoint, ...]]:
     """Return the magnets as sources by the rows that have a pose; ids are 1, 2, … in the order of the body.
 
-    The covariance of a magnet is that of the pose, without the errors of the body's own geometry and moments.
+    The covariance of a magnet follows from the pose, without the errors of the body's own geometry and moments.
     """
     rows = np.flatnonzero(poses.solved)
     R = poses.R[rows, 0]

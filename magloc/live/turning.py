@@ -76,7 +76,7 @@ class SensorTurning:
         return self.inflation * math.sqrt(float(np.max(np.diagonal(self.fit.covariance)[3:])))
 
     def is_uniform(self, noise_T: float, modulus_T: float) -> bool:
-        """Return True if there is a fit, and its residuals are those of a uniform field."""
+        """Return True if there is a fit whose residuals agree with a uniform field."""
         return self.fit.converged and self.inflation * noise_T <= _SPOILT * modulus_T
 
     @property

@@ -83,7 +83,7 @@ class NearnessTest:
 def dipole_validity(distance_m: ArrayLike, body_length_m: ArrayLike) -> BoolArray:
     """Return True if a body is at least three lengths away, so that it counts as a dipole.
 
-    The length is that of the longest side. At three lengths the field of a uniformly magnetised body differs from that
+    The length is the longest side. At three lengths the field of a uniformly magnetised body differs from that
     of a dipole by at most 0.3 % for a cube, 1.3 % for a cylinder as long as it is wide, 5 % for a flat brick and 6 %
     for a thin rod. On the axis of the rod the ratio of the two fields is ``1/(1 - (L/2r)²)²``.
 

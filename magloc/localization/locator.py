@@ -159,7 +159,7 @@ class Locator:
         readings_T : array_like, shape (n, C)
             Raw readings in channel order [T]; NaN where missing.
         ambient_T : array_like, shape (n, 3), optional
-            Ambient field of every row in the array's frame [T], in place of the array's own.
+            Ambient field of every row in the array's frame [T], instead of the array's own.
         time_s : ndarray, shape (n,), optional
             Times of the rows [s]; 0, 1, 2 … by default.
         progress : callable, optional
@@ -300,7 +300,7 @@ def fit_at_rest(
     """Fit one source at rest to several rows of a moving array, in the world frame.
 
     A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row has its own common
-    field. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior in the
+    field. Parameters: see :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior in the
     world frame. Errors of `poses` count as noise.
     """
     rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
@@ -347,7 +347,7 @@ def locate(
     prior : SourcePrior
         Bounds of position and moment for every source; solutions outside of them are rejected.
     ambient_T : array_like, shape (n, 3) or (3,), optional
-        Ambient field in the array's frame [T], in place of that of the readings or the array.
+        Ambient field in the array's frame [T], instead of that of the readings or the array.
     body_length_m : float, optional
         Length of the object [m], 0 for a point; by default as for :class:`Locator`.
     magnet : Shape, optional

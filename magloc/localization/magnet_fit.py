@@ -1,6 +1,6 @@
 """Fit of a magnet of known shape, from the dipoles that fit its readings.
 
-A dipole in place of a magnet that is nearer than a few of its lengths is off by a few hundredths of its distance, which
+A dipole instead of a magnet that is nearer than a few of its lengths is off by a few hundredths of its distance, which
 serves as a start. From it a damped Gauss-Newton iteration has the exact field. The roll of a cuboid counts as noise,
 linearised at the best fit as in :mod:`magloc.localization.model_errors`.
 """

@@ -87,7 +87,7 @@ class WeightedFits:
     def misfit(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
         """Return squared residuals (f, N) of the sensors of some rows.
 
-        The common field is that of the weighted fit.
+        The common field comes from the weighted fit.
         """
         return self._squares(self._weight(row, weight), q, mu, weight)
 

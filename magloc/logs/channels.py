@@ -37,7 +37,7 @@ class LogChannel:
         Times of the values by the clock [s].
     values : ndarray, shape (n,)
     clock : str
-        Clock of the times: "boot" counts from the start of the autopilot, "unix" from 1970 (UTC), "rows" counts rows.
+        Clock of the times: "boot": since the start of the autopilot, "unix": since 1970 (UTC), "rows": numbers of rows.
     logged_unit : str
         Unit in the log.
     si_per_unit : float

@@ -32,7 +32,7 @@ def propose_log_columns(log: Log) -> Proposal:
         keys |= {"unit": names[0] if names else 1e9 * first.si_per_unit} if names[:1] != ["nT"] else {}
         others = {log[names[0]].time_s.tobytes() for names in sensors.values()}
         if len(others) > 1:
-            asked.append("sensors have other clocks: the rows are those of the first, and the others are interpolated")
+            asked.append("sensors have other clocks: rows follow the first one, and the others are interpolated")
     else:
         asked.append('no channel is a magnetic field by its unit: name those of the sensors as s1 = ["bx", "by", "bz"]')
     keys |= _places(log, asked)

@@ -37,7 +37,7 @@ def table_of_file(path: str | PathLike[str], form: LogFormat) -> Table:
 def _table_of_log(log: Log, form: LogFormat) -> tuple[Table, int]:
     """Return the columns of a log that a format names, in the units of the log, and the number of rows ignored.
 
-    The rows are those of the first sensor, as far as there is an attitude, if one is named. Other channels are
+    The rows follow the first sensor, as far as there is an attitude, if one is named. Other channels are
     interpolated to its times; they are missing in gaps.
     """
     if form.columns is None:  # a table with the columns of a readings file

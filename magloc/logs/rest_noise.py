@@ -175,7 +175,7 @@ def log_rest_noise(log: Log) -> tuple[RestNoise, ...]:
     longest = int(np.argmax(np.diff(ends_s)))
     begin_s, end_s = ends_s[longest] + _MARGIN_S, ends_s[longest + 1] - _MARGIN_S
     if turns.any():
-        _LOG.warning(f"{log.path}: the robot turns; its noise is that of {begin_s:.1f} to {end_s:.1f} s")
+        _LOG.warning(f"{log.path}: the robot turns; the noise is from {begin_s:.1f} to {end_s:.1f} s")
     named: Sequence[tuple[VectorReadings, str]] = [
         *((each, "T") for each in sensors.magnetometers),
         (sensors.gyro, "rad/s"),

@@ -1,8 +1,8 @@
-"""Readings of a magnet of known shape, in place of a dipole.
+"""Readings of a magnet of known shape, instead of a dipole.
 
 Its field is exact (:mod:`magloc.fields.shapes`), so that it may be as near to a sensor as its own size. The magnet is
-magnetised along its axis and turns with its moment: the state is that of a dipole, position and moment. A cuboid also
-has a roll about its axis, an unknown of each row beside the state.
+magnetised along its axis and turns with its moment: the state is a dipole's, position and moment. A cuboid also
+has a roll about its axis, an unknown of each row besides the state.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class MagnetModel(WhitenedModel):
     def roll_errors(self, q: FloatArray, mu: FloatArray) -> FloatArray:
         """Return the effects (b, C, n) of a cuboid's unknown roll, one σ each in units of the noise; n may be 0.
 
-        With a roll it is that of its error; otherwise those of the roll's first harmonic, its cosine and sine.
+        With a roll there is one column, for its error; otherwise two, for cosine and sine of the first harmonic.
         """
         gain = self.linear_gain(self.source_fields(q, mu))
         if self.magnet.kind != "cuboid":

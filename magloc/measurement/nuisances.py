@@ -154,7 +154,7 @@ class SensorErrors:
 
     @property
     def has_induced(self) -> bool:
-        """True if an error is that of an induced field or of eddy currents."""
+        """True if an error belongs to an induced field or to eddy currents."""
         return bool((self.of_sensor[:, 1] >= _INDUCED).any())
 
     @property
@@ -214,7 +214,7 @@ def ambient_in_array(array: SensorArray, readings_T: FloatArray, ambient_T: Floa
 def with_eddies_as_offsets(array: SensorArray, ambient_T: FloatArray, rate_rad_s: FloatArray) -> SensorArray:
     """Return the array with eddy currents as offset errors of the same rms.
 
-    Ambient fields and rates of rotation (n, 3) are those of the rows.
+    Ambient fields and rates of rotation (n, 3) have one row for each row of readings.
     """
     change_T_s = math.sqrt(np.mean(np.sum(np.cross(ambient_T, rate_rad_s) ** 2, axis=-1)))
     sensors = tuple(

@@ -1,4 +1,4 @@
-"""Wild readings: jumps that no source causes, because rows beside them show no flanks of a peak.
+"""Wild readings: jumps that no source causes, because neighbouring rows show no flanks of a peak.
 
 The rows are cut into pieces where neighbours differ by far more than usual. The result keeps the largest set of pieces
 that agree. Pieces agree if a Gaussian process, with the covariance of sources below a depth, predicts each from the

@@ -1,6 +1,6 @@
 """House style of all figures: sizes for print, and colours for colour-blind readers and grey printing.
 
-A figure is as wide as the text of an A4 page, so that font sizes hold on paper. The colours are those of Okabe and Ito
+A figure is as wide as the text of an A4 page, so that font sizes hold on paper. The colours are by Okabe and Ito
 ("Color Universal Design", 2008). Colours in one panel differ by at least 20 in CIE lightness; markers or lines differ
 too.
 """

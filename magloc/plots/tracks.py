@@ -60,7 +60,7 @@ _PLAN_IN = (1.2, 3.4, 6.2)
 _NARROWEST = 0.2
 # Least span of a coordinate's axis relative to the plan's width: a source at rest must not get ticks of 1 µm.
 _LEAST_HEIGHT = 0.01
-# Okabe and Ito, for colour-blind readers; the first colour is that of estimates.
+# Okabe and Ito, for colour-blind readers; the first colour is for estimates.
 _SOURCE_COLOURS = (style.ESTIMATE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY_BLUE)
 
 
@@ -122,7 +122,7 @@ def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Fi
 def _tracks_figure(
     tracks: Mapping[str, Sequence[TrackPoint]], truth_m: FloatArray | None, array_m: FloatArray | None
 ) -> Figure:
-    """Draw tracks by the names of their sources; the truth is that of a single source."""
+    """Draw tracks by the names of their sources; the truth has a single source."""
     tracks = {name: on_track(points) for name, points in tracks.items()}
     columns = {name: states_of(points) for name, points in tracks.items()}
     tracked = np.any([np.isfinite(position[:, 0]) for _, position, _, _ in columns.values()], axis=0)

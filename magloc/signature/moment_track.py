@@ -90,7 +90,7 @@ class MomentTrack(TrackColumns):
     Attributes
     ----------
     points : tuple of TrackPoint
-        One point per row. Positions are those of the path, corrected if it is uncertain.
+        One point per row. Positions are from the path, corrected if it is uncertain.
     readings : Readings
         Readings of the track.
     model : MomentModel
@@ -238,7 +238,7 @@ def track_moments(
     Returns
     -------
     tuple of MomentTrack
-        One track per source. Covariances allow for the other unknown moments; χ² is that of all sources together.
+        One track per source. Covariances allow for the other unknown moments; χ² contains all sources together.
 
     Raises
     ------

@@ -42,7 +42,7 @@ LEAST_KNOWN = 0.5
 """Share of the object's moment above which the σ of a combination of parameters means "not determined"."""
 # Share of the largest component of a combination below which a parameter is not named.
 _NAMED = 0.1
-# Smallest divisor in place of the rate of an ambient field that does not change [T/s].
+# Smallest divisor instead of the rate of an ambient field that does not change [T/s].
 _NO_RATE = 1e-9
 
 
@@ -231,7 +231,7 @@ class Signature(Result):
     ) -> tuple[FloatArray, FloatArray]:
         """Return the field on a level keel and a steady course, and its covariance.
 
-        The field is that of a dipole, which is wrong nearer than about three lengths of the body.
+        The model is a dipole, which is wrong nearer than about three lengths of the body.
 
         Parameters
         ----------

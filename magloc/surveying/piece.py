@@ -83,7 +83,7 @@ class Ground:
             received = f"{ground_m:g} m with one at {low[2]:g} m"
             if not self.terrain.is_flat:
                 above = f"{self.terrain.name or 'terrain'} that is {ground_m - low[2]:.3g} m above one"
-                received = f"{above} (their heights may count from different levels, such as sea and ellipsoid)"
+                received = f"{above} (their heights may refer to different levels, such as sea and ellipsoid)"
             raise ValueError(f"Input ground_m must be below all sensors; instead received {received}.")
         own_low = np.array([low[0] - _MARGIN_M, low[1] - _MARGIN_M, ground_m - _DEEPEST])
         own_high = np.array([high[0] + _MARGIN_M, high[1] + _MARGIN_M, self.shallowest_m])

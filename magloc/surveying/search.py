@@ -143,7 +143,7 @@ def normal_equations(
 
     Some groups of rows take part.
 
-    The first matrix is that of the moments alone, the second has everything else projected out by Q; ``left`` is the
+    The first matrix contains the moments alone, the second has everything else projected out by Q; ``left`` is the
     residual.
     """
     A = white.of_moments(record, directions, places, used)

@@ -49,7 +49,7 @@ def read_terrain(
 ) -> Terrain:
     r"""Read the ground below a survey from a file of heights.
 
-    Heights count from the same level as `origin`, such as the sea.
+    Heights refer to the same level as `origin`, such as the sea.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ class Terrain:
         return replace(self, height_m=self.height_m + height_m)
 
     def place_above(self, readings: Readings) -> Readings:
-        """Return readings whose heights count from the ground with their heights in the world frame."""
+        """Return readings whose heights are above the ground with their heights in the world frame."""
         place = readings.array_position_m
         if place is None:
             return readings
@@ -200,7 +200,7 @@ def interpolate_points(place_m: FloatArray) -> Callable[[FloatArray], FloatArray
 
 
 def interpolate_nodes(values: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return a function of indices (2, n): a cubic spline through the nodes, NaN beside nodes without a value."""
+    """Return a function of indices (2, n): a cubic spline through the nodes, NaN next to nodes without a value."""
     unknown = np.isnan(values).astype(np.float64)
     spline = _spline_coefficients(_fill(values))
 
@@ -223,7 +223,7 @@ def _evaluate(spline: FloatArray, at: FloatArray) -> FloatArray:
 
 
 def _fill(values: FloatArray) -> FloatArray:
-    """Return values (nx, ny) with the nearest one in place of NaN."""
+    """Return values (nx, ny) with the nearest one instead of NaN."""
     nearest = distance_transform_edt(np.isnan(values), return_distances=False, return_indices=True)
     return np.asarray(values[tuple(nearest)])
 

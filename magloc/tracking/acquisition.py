@@ -224,7 +224,7 @@ class CartesianFilter:
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> StartState | None:
         """Return the state at the last of the rows from which a source (6,) at rest was fitted.
 
-        `covariance` (6, 6) is that of the fit. A filter passes over the rows from a nearly flat prior, and linearises
+        `covariance` (6, 6) comes from the fit. A filter passes over the rows from a nearly flat prior, and linearises
         them at its last result until this converges. So motion between the rows and their common errors of sensors
         count as in later rows. Return None if it does not converge, or if the rows contradict each other.
         """

@@ -99,7 +99,7 @@ def lines_of_track(points: Sequence[TrackPoint | SourcesPoint], *, most: int | N
 def json_entry(point: TrackPoint | SourcesPoint, *, single: bool = False) -> dict[str, object]:
     """Return the JSON object of one row, with null where there is no answer.
 
-    Without a track the range is that of the row alone, and its solutions are the rivals. A row of several sources has a
+    Without a track, range and `rivals` come from the row alone. A row of several sources has a
     list of tracks; with `single`, for at most one source, the row has the keys of that source too.
     """
     if isinstance(point, SourcesPoint):
@@ -269,7 +269,7 @@ def read_track(path: Path) -> TrackResult:
 
 
 def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[TrackPoint, ...]]:
-    """Return the points of each source by its id; rows without the key tracks are of source 0."""
+    """Return the points of each source by its id; rows without the key tracks belong to source 0."""
     if not any("tracks" in entry for entry in entries):
         return {0: _points(path, entries)}
     own: list[dict[int, dict[str, Any]]] = []

@@ -296,7 +296,7 @@ def stack_rows(rows: Sequence[RowMeasurement]) -> Rows:
 
 
 def zero_if_nan(derivative: FloatArray) -> FloatArray:
-    """Return a derivative with zeros in place of NaN.
+    """Return a derivative with zeros instead of NaN.
 
     Moduli without an ambient field have no derivative at a moment of zero.
     """

@@ -31,11 +31,11 @@ class Row:
     origin_m, R_world_from_array : ndarray, shapes (3,) and (3, 3)
         Pose of the array.
     ambient_T : ndarray, shape (3,), optional
-        Ambient field in the array's frame, in place of the array's own.
+        Ambient field in the array's frame, instead of the array's own.
     velocity_m_s, rate_rad_s : ndarray, shape (3,), optional
         Velocity of the array in the world and its rate about its own axes; by default from the row before.
     pose_sigma : ndarray, shape (2,), optional
-        Standard deviations of position [m] and attitude [rad], in place of the array's own.
+        Standard deviations of position [m] and attitude [rad], instead of the array's own.
     """
 
     time_s: float

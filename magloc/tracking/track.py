@@ -168,7 +168,7 @@ class TrackColumns(TrackRows[TrackPoint]):
         A source at rest is one point. A moving source has a point for each row, and a line for each unbroken part.
 
         A source is at rest if no row differs from the best known one by more than their uncertainties together. Its
-        point and its σ are those of the best row.
+        point and its σ are from the best row.
 
         Parameters
         ----------

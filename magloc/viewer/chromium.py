@@ -81,7 +81,7 @@ class Chromium(Closing):
             self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None, ping_interval=None)
             for domain in ("Network", "Page", "Runtime"):
                 self.call(f"{domain}.enable")
-            # The size of the window includes its frame; these metrics are those of the page.
+            # The size of the window includes its frame; these metrics are for the page alone.
             metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
             self.call("Emulation.setDeviceMetricsOverride", **metrics)
             self.open(url)

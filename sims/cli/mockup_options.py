@@ -102,7 +102,7 @@ class MockupOptions:
     sky : Path, optional
         sky, all: TOML file of the positions of the lights; by default 180 random ones.
     frames : Path, optional
-        sky: PNG file, or a folder of PNG files, to identify in place of simulated frames; needs --sky.
+        sky: PNG file, or a folder of PNG files, to identify instead of simulated frames; needs --sky.
     fusion : str, optional
         fusion, all: integration from the exposure of each fix ("paper"), the same with corrected velocity
         ("velocity-corrected"), the delayed error-state filter ("ekf", the default), fixes alone, delayed and held
@@ -123,7 +123,7 @@ class MockupOptions:
     outage : float, optional
         fusion, all: begin and end of a period without frames [s].
     samples : Path, optional
-        fusion: CSV file of a recording, in place of simulated drives, with time_s, acceleration_x_m_s2,
+        fusion: CSV file of a recording, instead of simulated drives, with time_s, acceleration_x_m_s2,
         acceleration_y_m_s2 and rate_deg_s of every sample; needs --fixes.
     fixes : Path, optional
         fusion: CSV file of the fixes of a recording, with exposure_s, arrival_s, x_m, y_m and heading_deg; needs

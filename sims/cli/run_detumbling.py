@@ -52,7 +52,7 @@ def detumbling(
     duration : float
         Duration of a run [s].
     json : bool
-        Print one JSON object, in place of the text.
+        Print one JSON object, instead of the text.
     common : QuietOptions
         Common options.
     """

@@ -44,7 +44,7 @@ class EllipsoidOptions(RunOptions):
     jump : bool
         After 2000 s the errors of the readings are four times their bound.
     closed_loop : bool
-        Simulate the satellite in its attitude loop, in place of the error dynamics alone.
+        Simulate the satellite in its attitude loop, instead of the error dynamics alone.
     seeds : int
         Number of runs.
     seed : int

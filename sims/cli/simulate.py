@@ -33,7 +33,7 @@ def simulate(
     out : Path
         Readings file (CSV) to write. Existing files are replaced.
     body_length_m : float
-        Length of every source [m], in place of the scenario's: a thin bar along the body's axis x with the moment of
+        Length of every source [m], instead of the scenario's: a thin bar along the body's axis x with the moment of
         the source. 0 for a point source.
     json : bool
         Print one JSON object with the names of the files.

@@ -35,7 +35,7 @@ class EllipsoidSettings:
     n_steps: int  # of 2 s
     step: StepRule = "tightened"  # rule by which a set shrinks to a reading
     jump_s: float | None = None  # when the readings become four times as bad as their bound
-    closed_loop: bool = False  # the satellite in its attitude loop in place of the dynamics of the error alone
+    closed_loop: bool = False  # the satellite in its attitude loop instead of the dynamics of the error alone
 
 
 @dataclass(frozen=True, eq=False)

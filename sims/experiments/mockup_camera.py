@@ -24,7 +24,7 @@ class TableCamera:
     ----------
     sky : LedSky
     setup : SkySetup
-        Quality of the frames, and the calibration of the camera; positions and motions are those of the drive.
+        Quality of the frames, and the calibration of the camera; positions and motions are from the drive.
     matcher, finder : callable
         Functions as in :func:`sims.experiments.sky_run`.
     delay_s : float, optional

@@ -157,7 +157,7 @@ class SkyRun:
         return self.found & ~self.good
 
     def summary(self) -> dict[str, Any]:
-        """Return the statistics of the run; rms errors are those of good fixes, None without any.
+        """Return the statistics of the run; rms errors are over good fixes, None without any.
 
         Returns
         -------

@@ -1,7 +1,7 @@
 r"""Paths of arrays and sources: positions and attitudes as functions of time.
 
 World frame: x east, y north, z up [m]. A course ψ is counted clockwise from north, so that its direction is
-(sin ψ, cos ψ, 0). A carrier's own axes are forward, left and up: with the course 90° they are those of the world.
+(sin ψ, cos ψ, 0). A carrier's own axes are forward, left and up: with the course 90° they are parallel to the world's.
 
 Every path is a frozen dataclass with ``at(time_s) -> Motion``.
 """
@@ -132,7 +132,7 @@ class Waypoints:
             raise ValueError(f"Input speed_m_s must be positive; instead received {self.speed_m_s:g}.")
 
     def at(self, time_s: ArrayLike) -> Motion:
-        """Return the motion at instants (n,) [s]; at a corner the velocity is that of the next leg."""
+        """Return the motion at instants (n,) [s]; at a corner the velocity belongs to the next leg."""
         points = np.array(self.points_m, dtype=np.float64)
         legs = np.diff(points, axis=0)
         lengths = np.linalg.norm(legs, axis=1)

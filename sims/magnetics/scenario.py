@@ -133,7 +133,7 @@ class MagneticScenario:
     Attributes
     ----------
     array : SensorArray
-        Positions of the sensors, and their known calibration. Noise, limits and uncertainties are those of the models.
+        Positions of the sensors, and their known calibration. The models state noise, limits and uncertainties.
     models : tuple of SensorModel
         Model of each sensor.
     duration_s, rate_Hz : float

@@ -72,7 +72,7 @@ def read_scenario(name_or_path: str) -> MagneticScenario:
 
 def _array_and_models(path: str, file: FileTable) -> tuple[SensorArray, tuple[SensorModel, ...]]:
     common = file.sensors
-    # What one sensor's table does not give is that of all sensors, unless it is another kind.
+    # A sensor's table inherits missing keys from the table of all sensors, unless it is another kind.
     single = {name: own if own.kind is not None else _merged(common, own) for name, own in common.of.items()}
     if isinstance(file.array, str):
         array = read_array(FilePath(path).parent / file.array)

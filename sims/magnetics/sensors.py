@@ -89,7 +89,7 @@ SENSOR_KINDS = {kind: SensorModel(**attributes) for kind, attributes in _FIGURES
 def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
     """Return the model of a sensor from an array file, without errors that it does not state.
 
-    ``rate_Hz``: rate at which its noise is that of one sample.
+    ``rate_Hz``: rate at which its noise is stated for one sample.
     """
     model = SensorModel(
         reads=sensor.kind,

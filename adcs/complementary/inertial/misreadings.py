@@ -71,7 +71,7 @@ class _Windows:
 
 
 def check_lengths(acceleration_m_s2: FloatArray, field_T: FloatArray, starting: BoolArray) -> None:
-    """Raise ValueError if the length of the acceleration or of the field is that of another unit.
+    """Raise ValueError if the length of the acceleration or of the field fits another unit.
 
     Both the first second (``starting``, (n,)) and the whole log must show it.
     """

@@ -1,4 +1,4 @@
-"""Filter of attitude and gyro bias, (δq, δΔω), with the gyro as an input in place of a measurement.
+"""Filter of attitude and gyro bias, (δq, δΔω), with the gyro as an input instead of a measurement.
 
 See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
 2014, Table 5, row [λ, Δω].
@@ -30,7 +30,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: FilterStart) ->
     """Run the reduced filter over whole runs.
 
     ``settings``: a set with a gyro and the state ``gyro-bias`` alone. Its q_λ and q_g are used; the gyro's noise is
-    added to the attitude. ``start``: only its attitude is used; the rate is that of the gyro. The covariance is that of
+    added to the attitude. ``start``: only its attitude is used; the rate is from the gyro. The covariance has the order
     (δq, δω, δΔω), where δω is minus the error of the bias plus the gyro's noise.
     """
     used = settings.sensors

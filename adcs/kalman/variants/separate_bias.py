@@ -38,7 +38,7 @@ def run_parallel(
     """Filter whole runs with a parallel filter of the disturbance.
 
     ``settings``: a set with the state ``disturbance``; forgetting replaces its process noise q_d. ``forgetting``: λ,
-    above 0 and at most 1. The covariance is that of all states, with the disturbance last.
+    above 0 and at most 1. The covariance contains all states, with the disturbance last.
     """
     if "disturbance" not in settings.sensors.states:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")

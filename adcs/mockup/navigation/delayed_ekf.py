@@ -254,7 +254,7 @@ class DelayedFilter:
         self.nis: list[float] = []
         self._densities = settings.all_densities
         self._n = 1
-        # Row 0 is the beginning of the history; the reading of a row is that of the interval that ends there.
+        # Row 0 is the beginning of the history; the reading of a row belongs to the interval that ends there.
         self._time_s = np.full(1, float(begin_s))
         self._readings, self._there = np.zeros((1, 3)), np.zeros((1, 3), dtype=np.bool_)
         self._lost = np.zeros((1, 2), dtype=np.bool_)  # accelerations, rate

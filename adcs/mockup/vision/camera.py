@@ -66,7 +66,7 @@ class Camera:
     k1 : float
         Relative radial distortion at 320 px.
     exposure_s : float
-        Time over which a moving light is smeared; the pose is that of its middle.
+        Time over which a moving light is smeared; the pose refers to its middle.
 
     Raises
     ------

@@ -46,7 +46,7 @@ class PoseErrors:
 class BodyCalibration(Calibration):
     """A calibration of an array's sensors and a body's magnets together.
 
-    The standard deviations contain what the readings cannot show (`unobservable`); there they are those of the prior.
+    The standard deviations include directions that the readings cannot show (`unobservable`), with the prior's values.
     The calibrated array and body state smaller ones, without these directions, because a common change of array and
     body has no effect on the readings.
 

@@ -20,7 +20,7 @@ _MOST_ROWS = 200
 def with_posterior(
     problem: BodyProblem, state: BodyState, information: FloatArray, array: SensorArray, body: MagnetBody
 ) -> tuple[SensorArray, MagnetBody]:
-    """Return the array and the body with their posterior uncertainty in place of the one that they state.
+    """Return the array and the body with their posterior uncertainty instead of the one that they state.
 
     Files state independent errors of single sensors and magnets. The posterior errors are correlated: most of them
     cancel in the readings. The stated ones are scaled by one factor, so that the variance of the readings that they

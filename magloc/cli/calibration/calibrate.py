@@ -100,7 +100,7 @@ def calibrate(
     figures : Path
         Folder for figures and their data: residuals before and after, and the changes of the calibration.
     json : bool
-        Print one JSON object in place of the table.
+        Print one JSON object instead of the table.
     common : CommonOptions
         Common options.
     """
@@ -205,7 +205,7 @@ def _path(readings: Readings, path: Path | None, height_m: float | None, reading
 
     if path is None:
         if height_m is not None:
-            raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")
+            raise InputError("--height-m: found no --truth, expected it because the height belongs to its path.")
         return None
     truth = read_truth(path)
     if not rows_of_same_time(readings, truth)[0].size:

@@ -41,7 +41,7 @@ def columns(
     instrument : str
         Instrument that wrote the log, such as magarrow or gsm19. An unknown name lists all.
     out : Path
-        Array file to write, in place of printing the proposal.
+        Array file to write, instead of printing the proposal.
     rest : Path
         Folder for the noise of a log of an autopilot at rest: allan.csv and allan.png, the Allan deviation of
         magnetometers, gyro and accelerometer, and sensors.toml, tables of a scenario file. The proposal then has the

@@ -53,7 +53,7 @@ def signature(
     depth_m : list of float
         Depths below the path [m] at which to predict the field along the keel, on four headings.
     json : bool
-        Print one JSON object in place of the table.
+        Print one JSON object instead of the table.
     known : KnownOptions
         Prior knowledge of the sensors and of the ambient field.
     error : PathErrorOptions

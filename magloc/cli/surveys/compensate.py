@@ -81,7 +81,7 @@ def compensate(
         CSV file to write: the log, with a column ID_compensated_nT for each channel and ID_compensation_sigma_nT for
         each sensor.
     json : bool
-        Print one JSON object in place of the table.
+        Print one JSON object instead of the table.
     common : CommonOptions
         Common options.
     """

@@ -39,7 +39,7 @@ class SurfaceOptions:
         ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
         from the ground.
     terrain_sigma_m : float
-        Standard deviation of the heights of the ground below the sensors [m]. Intervals of depths count it.
+        Standard deviation of the heights of the ground below the sensors [m]. Intervals of depths include it.
     """
 
     ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
@@ -107,13 +107,13 @@ class SurfaceOptions:
 
 
 def _note_clearance(ground: Terrain, place_m: FloatArray) -> None:
-    """Print a note if places (n, 3) are high above terrain, as they are if both count from different levels."""
+    """Print a note if places (n, 3) are high above terrain, as they are if both refer to different levels."""
     import numpy as np
 
     low_m, usual_m = np.nanquantile(-ground.depth_of(place_m), [0.0, 0.5]).tolist()
     if low_m > _HIGH_M:
         note(
-            f"note: the log is {low_m:.4g} m or more, and in the median {usual_m:.4g} m, above {ground.name}. If it was"
-            " flown lower, it counts from the ellipsoid and the terrain from the sea: raise the terrain by the"
-            " difference (--ground-m)"
+            f"note: the log is {low_m:.4g} m or more, and in the median {usual_m:.4g} m, above {ground.name}. If it"
+            " was flown lower, its heights are above the ellipsoid and the terrain's above the sea: raise the"
+            " terrain by the difference (--ground-m)"
         )

@@ -53,7 +53,7 @@ def qc(
     out : Path
         Folder for qc.csv, the table, and qc.png: lines by their height, strips between them, speed, and noise.
     json : bool
-        Print one JSON object in place of the table.
+        Print one JSON object instead of the table.
     common : QuietOptions
         Common options.
     """

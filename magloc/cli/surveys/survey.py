@@ -131,7 +131,7 @@ def survey(
     review : ReviewOptions
         Review of the targets.
     json : bool
-        Print one JSON object in place of the table.
+        Print one JSON object instead of the table.
     common : CommonOptions
         Common options.
     """
@@ -227,11 +227,11 @@ def _map_frame(array: arrays.SensorArray, origin: Vector | None, crs: str | None
 
 
 def _note_ground(given: arrays.SensorArray, used: arrays.SensorArray, ground: GroundOptions) -> None:
-    """Print a note if the stated height of the ground counts from the first place of the log."""
+    """Print a note if the stated height of the ground is measured from the first place of the log."""
     is_stated = given.columns == used.columns or used.columns is None or used.columns.above_ground
     if is_stated or ground.terrain is not None:
         return
-    note(f"note: --ground-m counts from the height of that place, negative below it: found {ground.ground_m:g} m")
+    note(f"note: --ground-m is measured from the height of that place, negative below it: found {ground.ground_m:g} m")
 
 
 def _json_of_map(found: Survey, frame: MapFrame | None) -> dict[str, Any]:

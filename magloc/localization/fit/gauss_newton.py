@@ -1,6 +1,6 @@
 """Damped Gauss-Newton fits of several dipoles to any sensors, many fits at once.
 
-The coordinates are those of :mod:`magloc.measurement.whitened`. Positions are damped, moments are not. After every step
+:mod:`magloc.measurement.whitened` defines the coordinates. Positions are damped, moments are not. After every step
 of the positions the moments are fitted again; for vector sensors the iteration is then variable projection.
 
 Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's common field.

@@ -34,7 +34,7 @@ _LARGEST_SINGLE = 1e15  # largest residual, in units of noise, for single precis
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
     """Return whitened orthonormal bases (C, 3 n) of unit moments at candidates (n, 4), for linear channels.
 
-    Columns are ordered by moment axis, then by candidate. The whitening is that of `row`; `gain` (C, 3) is in units of
+    Columns are ordered by moment axis, then by candidate. The whitening is `row`'s; `gain` (C, 3) is in units of
     the noise. Single precision is enough to rank candidates.
     """
     columns = problem.basis[row] * np.sqrt(problem.shrinkage[row])

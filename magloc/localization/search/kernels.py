@@ -59,7 +59,7 @@ def choose_candidates(
 ) -> NDArray[np.intp]:
     """Return the candidates (rows, n_chosen) that explain most of each row, best first, and some angle apart.
 
-    Components (rows, 3, n) are those of the rows along the bases of the candidates (n, 4). If too few candidates are
+    Components (rows, 3, n) are taken from the rows along the bases of the candidates (n, 4). If too few candidates are
     left, the first one is repeated.
     """
     chosen = np.empty((len(components), n_chosen), dtype=np.int64)

@@ -48,7 +48,7 @@ class MomentSearch:
     Raises
     ------
     ValueError
-        The position is not three finite numbers, or is that of a sensor, or of another source.
+        The position is not three finite numbers, or coincides with a sensor or another source.
     """
 
     def __init__(self, array: SensorArray, position_m: ArrayLike, *, prior: SourcePrior = NOTHING_KNOWN) -> None:

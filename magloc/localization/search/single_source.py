@@ -67,7 +67,7 @@ class BestFits:
 class _Ranking:
     """Candidates and their bases (C, 3 n) under the whitening of a mask.
 
-    If few channels are missing, the whitening and the bases are those of all channels, and missing readings are
+    If few channels are missing, the whitening and the bases contain all channels, and missing readings are
     unknowns. Then `orthonormal` (6, n) makes the candidates' components orthonormal without the directions `lost`
     (C, k).
     """

@@ -241,7 +241,7 @@ def _noise_factor(optima: Optima) -> FloatArray:
 def _known_position_columns(optima: Optima, position_m: FloatArray) -> _FitColumns:
     """Return the columns of moments at known positions (b, K, 3).
 
-    The range is that of the position.
+    The range is the length of the position.
     """
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, position, moment = rows.model, position_m[of_row], rows.model.moment(fits.q, fits.mu)

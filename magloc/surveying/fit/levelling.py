@@ -26,9 +26,9 @@ _STEPS = 12
 def line_levels(place_m: FloatArray, values: FloatArray, lines: Sequence[FlightLine]) -> FloatArray:
     """Return the level of every row (n,): offset and linear drift of its line.
 
-    Values are the sum of a smooth surface, of the levels, and of a remainder with outliers. The surface has no
-    wavelengths below some eight spacings of lines; it keeps what is longer. Where lines cross, their levels are
-    determined at all wavelengths, up to a bilinear surface.
+    Values are the sum of a smooth surface, of the levels, and of a remainder with outliers. The surface contains
+    only wavelengths above about eight spacings of lines. Where lines cross, their levels are determined at all
+    wavelengths, up to a bilinear surface.
 
     Parameters
     ----------

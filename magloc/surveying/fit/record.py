@@ -54,7 +54,7 @@ class SurveyRecord:
     beside_T, gradient_beside_T_m : ndarray, shapes (n, N, 3) and (n, N, 3, 3), or 0
         Field of known sources and its gradient; fitted sources add to them.
     terrain : Terrain
-        Ground that heights count from.
+        Ground that heights are measured from.
     """
 
     array: SensorArray

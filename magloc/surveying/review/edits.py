@@ -76,7 +76,7 @@ def add(edit: SurveyEdit, place_m: Sequence[float], name: str) -> SurveyEdit:
 
 
 def split(edit: SurveyEdit, target: str, places_m: Sequence[Sequence[float]], names: tuple[str, str]) -> SurveyEdit:
-    """Return the survey with two targets in place of one, at given places, or where they are likeliest."""
+    """Return the survey with two targets instead of one, at given places, or where they are likeliest."""
     if places_m:
         edit = drop(edit, target)
         for place_m, name in zip(places_m, names, strict=True):
@@ -109,7 +109,7 @@ def _piece_at(tiled: TiledSurvey, place_m: Sequence[float]) -> Piece:
 
 
 def _source_at(piece: Piece, place_m: Sequence[float]) -> Sources:
-    """Return the likeliest source at a place (x, y) or (x, y, z), beside the known ones."""
+    """Return the likeliest source at a place (x, y) or (x, y, z), in addition to the known ones."""
     model = piece.model()
     height, bounds, terrain = model.record.height_m, model.bounds, model.record.terrain
     x, y = np.clip(place_m[:2], bounds.low_m[:2], bounds.high_m[:2])
@@ -125,7 +125,7 @@ def _source_at(piece: Piece, place_m: Sequence[float]) -> Sources:
 
 
 def _likeliest_pair(piece: Piece, position_m: FloatArray) -> Sources:
-    """Return the likeliest two sources in place of the known one nearest to a position."""
+    """Return the likeliest two sources instead of the known one nearest to a position."""
     model, known = piece.model(), piece.known
     which = int(np.argmin(np.linalg.norm(known.position_m - position_m, axis=1)))
     height, bounds, terrain = model.record.height_m, model.bounds, model.record.terrain

@@ -183,7 +183,7 @@ class Channels:
     def of(self, row: Row) -> tuple[FloatArray, Cells]:
         """Return whitening (C, C) and cells of a row.
 
-        If the noise depends on the readings, they are those of the first row with the same channels.
+        If the noise depends on the readings, they are taken from the first row with the same channels.
         """
         key = row.available.tobytes()
         if key not in self._known:

@@ -3,7 +3,7 @@ r"""Tracks of readings with a drifting background: ``--detrend``, ``--high-pass-
 The background is a state of every channel besides the source, for readings without a filter: a filter would remove
 signal that the model still predicts. A single row does not separate source and background, so that a track cannot start
 from one. It starts from a track of filtered readings, about which all rows are linearised. A Kalman filter and smoother
-repeat until they converge: Gauss-Newton over the whole record. The points are those of the last filter pass, so that
+repeat until they converge: Gauss-Newton over the whole record. The points come from the last filter pass, so that
 each depends on earlier rows only.
 """
 

@@ -71,7 +71,7 @@ def _nearest_m(measurement: RowMeasurement, source: FloatArray) -> float:
 def _errors(measurement: RowMeasurement, source: FloatArray, length_m: float) -> FloatArray:
     """Return the effect (k, 14) of a body's errors of one σ on a row, in units of the noise.
 
-    The axes of the body are those of the world.
+    The axes of the body are parallel to the world's.
     """
     array, R = measurement.model.array, measurement.pose.R_world_from_array
     in_array = measurement.pose.to_array(source)

@@ -22,8 +22,8 @@ def posterior_bound(
     r"""Return the posterior Cramér-Rao bound of each row's position, by rows up to it, or by all rows if `smooth`.
 
     The bound (n,) [m] is the root of the trace for the position. It begins with the first row that shows a source, and
-    is infinite before. The prior is that of a tracker (:func:`magloc.tracking.chart.start.prior_root`). Lasting errors
-    of the sensors are unknowns with their standard deviations. Speed and turn rate are those of the truth.
+    is infinite before. The prior is a tracker's (:func:`magloc.tracking.chart.start.prior_root`). Lasting errors
+    of the sensors are unknowns with their standard deviations. Speed and turn rate are from the truth.
 
     By all rows it is the diagonal block of the inverse information of all states together (Šimandl, Královec and
     Tichavský 2001), by the recursion of Rauch, Tung and Striebel from the last row backwards:

@@ -152,7 +152,7 @@ class TestResult:
         again = run_json("--out", tmp_path, capsys=capsys)
         assert first == again  # the seconds too
         assert main(["bounds", *QUICK, "--accuracy-m", "1", "--out", str(tmp_path)]) == 2
-        assert "found another map, with accuracy_m 0.5 in place of 1.0" in capsys.readouterr().err
+        assert "found another map, with accuracy_m 0.5 instead of 1.0" in capsys.readouterr().err
 
     @pytest.mark.slow
     @with_plain_pictures

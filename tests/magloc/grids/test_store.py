@@ -298,9 +298,9 @@ class TestRefused:
     def test_another_map(self, waves, tmp_path):
         run(waves, tmp_path / "map.zarr")
         before = snapshot(tmp_path)
-        with pytest.raises(InputError, match=r"found another map, with phase 0.0 in place of 1.0"):
+        with pytest.raises(InputError, match=r"found another map, with phase 0.0 instead of 1.0"):
             Sweep(Waves(40, waves.log, edge=16, phase=1.0), tmp_path / "map.zarr")
-        with pytest.raises(InputError, match="with grid 40 in place of 41"):
+        with pytest.raises(InputError, match="with grid 40 instead of 41"):
             Sweep(Waves(41, waves.log, edge=16), tmp_path / "map.zarr")
         assert snapshot(tmp_path) == before
 

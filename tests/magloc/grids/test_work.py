@@ -81,7 +81,7 @@ class TestWorkers:
         before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
         monkeypatch.setattr(work, "_code", lambda: "another")
         (sentence,) = again()
-        assert sentence.endswith("3 finished parts are of another version of magloc, and are computed again")
+        assert sentence.endswith("3 finished parts are of another version of magloc and are computed again")
         assert len(list(tmp_path.iterdir())) == 6
         assert before == {path: path.stat().st_mtime_ns for path in before}
 

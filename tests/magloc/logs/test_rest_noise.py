@@ -93,7 +93,7 @@ def test_the_noise_goes_into_array_and_scenario_file(run, tmp_path: Path) -> Non
 
 def test_the_longest_rest_of_a_flight_is_used(run, data_folder: Path, tmp_path: Path) -> None:
     said = run("columns", data_folder / "flight-logs" / "sample.ulg", "--rest", tmp_path / "rest")
-    assert "the robot turns; its noise is that of 119.3 to 181.5 s" in said.err
+    assert "the robot turns; the noise is from 119.3 to 181.5 s" in said.err
 
 
 def test_a_short_rest_is_refused(run, tmp_path: Path) -> None:

@@ -350,4 +350,4 @@ class TestMaps:
     def test_the_ground_counts_from_the_first_place(self, log: Path, run: Run) -> None:
         outcome = run("survey", log, "--array", log.with_name("array.toml"))
         assert outcome.status == 2
-        assert "--ground-m counts from the height of that place, negative below it" in outcome.err
+        assert "--ground-m is measured from the height of that place, negative below it" in outcome.err
