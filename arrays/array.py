@@ -59,7 +59,7 @@ class SensorArray:
     pose : PoseUncertainty, optional
         Errors of the pose in the readings; None: the pose is exact.
     columns : LogColumns, optional
-        Names and units of the columns of its logs; None: those of a readings file.
+        Names and units of the columns of its logs; None: the names in a readings file.
 
     Raises
     ------

@@ -171,7 +171,7 @@ def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntAr
 
 
 def nearest_rows(wanted_s: FloatArray, time_s: FloatArray) -> IntArray:
-    """Return the row (k,) of the ascending times (n,) nearest to each wanted time; of two, the earlier."""
+    """Return the row (k,) of the ascending times (n,) nearest to each wanted time; of equally near ones the earlier."""
     after = np.clip(np.searchsorted(time_s, wanted_s), 1, max(1, len(time_s) - 1))
     before, after = after - 1, np.minimum(after, len(time_s) - 1)
     return np.where(np.abs(wanted_s - time_s[before]) <= np.abs(time_s[after] - wanted_s), before, after)

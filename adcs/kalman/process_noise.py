@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from adcs.kalman.error_state import ProcessNoise, SensorSet
 
 TUNED_KGM2 = 0.5
-"""Least principal moment of inertia for which the process noise is tuned: that of TabletSat-Aurora."""
+"""Least principal moment of inertia for which the process noise is tuned (TabletSat-Aurora's)."""
 
 
 def torque_scale(inertia_kgm2: ArrayLike | None) -> float:

@@ -60,7 +60,7 @@ class Terms:
         return all(known for name, kind, known in rows if name.startswith(f"{magnetometer} ") and kind in kinds)
 
     def without(self, magnetometers: Sequence[str] | None = None) -> Terms:
-        """Return the terms with those of some magnetometers, or all, as not determined by any motion."""
+        """Return the terms, those of some or all magnetometers marked as not determined by any motion."""
         ends = None if magnetometers is None else tuple(f"{name} " for name in magnetometers)
         gone = np.array([ends is None or name.startswith(ends) for name in self.names])
         return replace(self, largest=np.where(gone, 0.0, self.largest))

@@ -116,7 +116,7 @@ class MagnetometerCalibration(Drawn):
     residual_T : ndarray, shape (n,) or (n, 3)
         Calibrated modulus, or field, minus the model; NaN for rows that are not used.
     raw_rms_T : float
-        Root mean square of the same rows without a calibration; that of the modulus without an attitude.
+        Root mean square of the same rows without a calibration; without an attitude, of the modulus.
     chi2, dof : float, int
         Sum of squares of the whitened used rows, and their number.
     used : ndarray of bool, shape (n,)

@@ -43,8 +43,8 @@ def combined_star_fixes(
 ) -> StarReadings:
     r"""Combine fixes of star cameras into the attitude of their body at each instant with a fix.
 
-    A camera measures the rotation about its line of sight about ten times worse than those across it. Two cameras with
-    different lines of sight measure all three well. Fixes of one instant are averaged by their information,
+    A camera measures the rotation about its line of sight about ten times worse than rotations across it. Two cameras
+    with different lines of sight measure all three well. Fixes of one instant are averaged by their information,
     :math:`\delta\theta = (\sum C_k^{-1})^{-1} \sum C_k^{-1} \delta\theta_k`, all about the body's axes.
 
     Parameters
@@ -54,7 +54,8 @@ def combined_star_fixes(
     fixes : sequence of StarFix or NoFix
         Results of :func:`adcs.identify_stars`; NoFix is ignored.
     body_from_frame : Rotation or sequence of Rotation
-        Mounting of the camera, of all fixes or of each. The camera frame has x to the right, y up, z out of the sky.
+        Mounting of the camera, common to all fixes or one for each. The camera frame has x to the right, y up, z out of
+        the sky.
 
     Returns
     -------

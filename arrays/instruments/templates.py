@@ -229,7 +229,7 @@ def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _drop_replaced(columns: dict[str, Any], own: Mapping[str, Any]) -> None:
-    """Drop keys that contradict those of the user: another place, another attitude, a column of heights."""
+    """Drop keys that contradict the user's keys: another place, another attitude, a column of heights."""
     for keys in (("position", "geodetic"), ("quaternion", "angles", "course")):
         if any(key in own for key in keys):
             for key in set(keys) - own.keys():

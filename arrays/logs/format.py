@@ -207,7 +207,7 @@ class LogFormat:
 def log_origin(path: str | PathLike[str], columns: LogColumns, table: Table | None = None) -> Vector:
     """Return latitude, longitude [deg] and height [m] of the first position of a log.
 
-    The height is 0 if the log has heights above ground. ``table``: that of a log that is no text.
+    The height is 0 if the log has heights above ground. ``table``: the table of a log that is not text.
 
     Raises
     ------

@@ -50,7 +50,7 @@ class Magnet:
     Raises
     ------
     ValueError
-        A number is not finite, the moment is zero, or larger than that of any magnet of this size.
+        A number is not finite, the moment is zero, or larger than any magnet of this size has.
     """
 
     id: str

@@ -255,7 +255,7 @@ def _worst_case(result: Design) -> str:
         return f"Worst case that was found: {_number(result.worst_m)} m."
     text = "The worst case is infinite: at isolated directions and moments the differences lose rank"
     four_vector_sensors = result.task.kind == "vector" and result.task.n_sensors == 4
-    return f"{text}, as those of every array of four vector sensors do." if four_vector_sensors else f"{text}."
+    return f"{text}, as every array of four vector sensors does." if four_vector_sensors else f"{text}."
 
 
 def _comparison(other: Judgement) -> str:

@@ -259,7 +259,7 @@ def _signs_of_life(program: str) -> Iterator[None]:
 
 
 def _unknown_command(app: App, error: UnknownCommandError) -> str:
-    """Return the sentence for an unknown command; that of cyclopts would load every command."""
+    """Return the sentence for an unknown command; cyclopts would load every command for it."""
     token, *_ = error.unused_tokens or [""]
     names = [name for name in app if not name.startswith("-")]
     near = "".join(f' Did you mean "{name}"?' for name in difflib.get_close_matches(token, names, n=1))

@@ -262,7 +262,7 @@ class KnownOptions:
             raise InputError(f"--sensors {','.join(ids)}: {error}") from None
 
     def map_origin(self, array: SensorArray) -> Vector | None:
-        """Return the place on the Earth of the origin of the world frame: that of the array file, or else --place."""
+        """Return the place on the Earth of the world frame's origin, from the array file or else --place."""
         own = None if array.columns is None else array.columns.origin
         if own is None or self.place is None:
             return own or self.place

@@ -33,7 +33,7 @@ def compensate(
 ) -> Compensation:
     """Remove the field of the platform from the readings of sensors that move with it.
 
-    The platform adds a permanent field, an induced one, one of eddy currents, and those of measured currents (Tolles
+    The platform adds a permanent field, an induced field, and fields of eddy currents and measured currents (Tolles
     and Lawson). Their coefficients at each sensor are fitted to the modulus of the field, together with a slow
     background. Their priors are ``offset_uncertainty_T``, ``induced_uncertainty`` and ``eddy_uncertainty_s`` of the
     sensor, or wide ones if all are zero.

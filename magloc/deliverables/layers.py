@@ -49,7 +49,7 @@ def write_layers(path: Path, found: Survey, frame: MapFrame) -> None:
     ----------
     path : Path
         A GeoPackage (``.gpkg``) takes all layers. A Shapefile (``.shp``) takes the targets, and each other layer
-        becomes a file beside it, whose name ends with that of the layer.
+        becomes a file beside it, whose name ends with the layer's.
     found : Survey
     frame : MapFrame
         Coordinate system of the file, and the origin of the survey's world frame.

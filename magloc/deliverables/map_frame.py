@@ -60,7 +60,7 @@ class MapFrame:
 
     @cached_property
     def system(self) -> pyproj.CRS:
-        """System of coordinates as PROJ describes it; of one with heights the horizontal part."""
+        """System of coordinates as PROJ describes it; without the vertical part, if there is one."""
         system = coordinate_system(self.crs)
         parts = system.sub_crs_list if system.is_compound else [system]
         return parts[0].to_2d()

@@ -64,7 +64,7 @@ class Gaps(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """Distances (nx, ny) from the nearest line, NaN outside the survey, in cells from a corner [m]."""
+    """Distances (nx, ny) from the nearest line, NaN beside the survey, in cells from a corner [m]."""
 
     distance_m: FloatArray
     corner_m: FloatArray
@@ -102,8 +102,8 @@ class Quality(Result):
     lines_flown : list of FlightLine
         Lines in the order of time.
     fourth_T : ndarray, shape (n, N)
-        Fourth difference of each sensor's modulus, divided by √70: white noise keeps its standard deviation. NaN next
-        to gaps and unusable readings.
+        Fourth difference of each sensor's modulus, divided by √70: white noise keeps its standard deviation. NaN beside
+        gaps and unusable readings.
     missing, stuck, spikes : ndarray of bool, shape (n, N)
         Readings that a survey leaves out.
     heading : list of HeadingError or None

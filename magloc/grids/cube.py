@@ -82,7 +82,7 @@ class Variable(NamedTuple):
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of a map's values for its summary; the tallies of boxes add up to that of the cube.
+    """Counts of a map's values for its summary; the tallies of boxes add up to the cube's.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ _OF_FIELDS = {"position": "m", "translation": "m", "linear": "m/s", "angular": "
 def read_bag(path: Path) -> Log:
     """Return the channels of a bag: a file of ROS 1, a folder or file of ROS 2, or MCAP.
 
-    A message with a stamp has the time of its stamp, another one that of the recording.
+    A message has the time of its stamp or, without a stamp, of its recording.
 
     Raises
     ------

@@ -68,7 +68,7 @@ def _sensors(log: Log, asked: list[str]) -> dict[str, tuple[str, ...]]:
 
 
 def _places(log: Log, asked: list[str]) -> dict[str, object]:
-    """Return keys of the places: those of the message that has most of them."""
+    """Return the keys of the positions in the message that has most of them."""
     best: tuple[int, list[str]] = (0, [])
     for topic in log.topics:
         named = {field: name for name, field in topic.channel_names().items()}
@@ -104,7 +104,7 @@ def _described(topic: Topic) -> str:
 
 
 def _fields(topic: Topic) -> Iterator[str]:
-    """Yield the fields, those of one array together."""
+    """Yield the fields, grouped by array."""
     for stem, group in itertools.groupby(topic.fields, key=lambda field: re.sub(r"\[\d+\]$", "", field)):
         members = list(group)
         unit = topic.units.get(members[0])

@@ -149,7 +149,7 @@ def readings_vary(values: FloatArray) -> bool:
 
 
 def axes_of(name: str) -> tuple[str, str, str]:
-    """Return the channels of the three axes by that of the first."""
+    """Return the channels of the three axes, given the channel of the first."""
     if name.endswith("[0]"):
         stem = name.removesuffix("[0]")
         return f"{stem}[0]", f"{stem}[1]", f"{stem}[2]"

@@ -302,7 +302,7 @@ def _path_doubts(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
 
 
 def _attitude_doubts(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
-    """Yield a sentence if a field of steady modulus, that of the Earth, rotates in the world frame.
+    """Yield a sentence if a field of steady modulus (the Earth's) rotates in the world frame.
 
     The field is the mean reading of the vector sensors, otherwise the ambient field of the rows.
     """

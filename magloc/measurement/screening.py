@@ -197,7 +197,7 @@ def _limits(unknown: FloatArray) -> FloatArray:
     """Return the largest plausible prediction error in standard deviations.
 
     `unknown` is the variance of the prediction, for a process of unit variance. Sources are few, so their peaks are
-    higher than those of a normal process, the more so the coarser the rows are.
+    higher than those of a normal process, most of all if rows are coarse.
     """
     part = np.clip(unknown, 0.0, 1.0 - 1e-9)
     return np.asarray(_LIMIT * (1.0 + _COARSE * part) / (1.0 - part))

@@ -21,7 +21,7 @@ _SMALL_S = np.linspace(-1.5, 1.5, 31)
 _LEAPS_S = np.array([18.0, *(3600.0 * np.arange(1, 13))])  # GPS time is 18 s ahead of UTC, local times whole hours
 _LEAST_SHARE, _FEWEST = 0.3, 200  # of neighbours that a shift leaves
 _WORSE = 2.0  # ratio of the variances that lines do not share, without and with a shift
-_LEAST_S = 0.15  # a shorter shift is below the spacing of the grid
+_LEAST_S = 0.15  # a shorter shift is that of a spacing of the grid
 
 
 class ClockShift(NamedTuple):

@@ -25,7 +25,7 @@ _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
 def survey_figure(found: Survey) -> Figure:
-    """Draw maps of the anomaly, of its residual, and of the least moments that are found; lines are levelled.
+    """Draw maps of the anomaly, of its residual, and of the smallest detectable moments; lines are levelled.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ _SAME_PLACE_M = 1e-6
 _FELT = 0.3  # smallest change of sources that counts, in units of the noise of a group of rows
 _REACH = 0.6  # largest shift in a fit, relative to the distance from the sensors
 NEAR = 1.5
-"""Distance on the map within which rows are above a source, relative to that from the sensors."""
+"""Distance on the map within which rows are above a source, relative to its distance from the sensors."""
 _TWINS = 0.15  # largest distance of sources that are merged, relative to that from the sensors
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
@@ -197,7 +197,7 @@ class SearchState:
     def update(self, sources: Sources, background: SurveyBackground) -> Candidates:
         """Search again the tiles whose rows have changed, and return all candidates.
 
-        A change counts if it exceeds what noise and ground hide.
+        A change is significant if it exceeds noise and ground.
         """
         record, white, Q = self.model.record, background.white, background.Q
         now = record.predict(sources.fields(record))

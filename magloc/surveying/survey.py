@@ -168,7 +168,7 @@ def survey(
 
 
 def _warn_of_order(array: SensorArray, rows: Readings) -> None:
-    """Warn of sensors whose anomalies are larger than those of sensors below them."""
+    """Warn of sensors whose anomalies exceed those of sensors below them."""
     weaker = weaker_sensors_below(array, rows, size_of_anomalies(array, rows))
     for upper, lower in zip(array.ids, weaker, strict=True):
         if lower:

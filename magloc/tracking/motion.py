@@ -88,7 +88,7 @@ class MotionModel(Protocol):
         """Length of the state, of which the first six are position [m] and moment [A·m²]."""
 
     def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the state and root of its covariance from those of (p, m), (6,) and (6, 6)."""
+        """Return the state and the root of its covariance, given (p, m) (6,) and its root (6, 6)."""
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the predicted state (n,), its Jacobian F (n, n), and a noise root S_q (n, m)."""

@@ -34,7 +34,7 @@ class FlightSettings:
         Whether the vehicle yaws; else its heading is constant.
     magnetometers : int
     mounting : Rotation
-        Axes of the magnetometers from those of the body, without their own error of about 1°.
+        Rotation from the body's axes to the magnetometers', without their own error of about 1°.
     field_T : tuple of 3 floats
         Field of the Earth: east, north, up.
     offset_T, soft_iron, current_T_A, lag_s : float

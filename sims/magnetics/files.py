@@ -46,7 +46,7 @@ class SimulationFiles(NamedTuple):
 
 
 def files_beside(readings: str | PathLike[str], n_sources: int, *, has_targets: bool = False) -> SimulationFiles:
-    """Return the paths of the files of a simulation, from that of the readings.
+    """Return the paths of a simulation's files, given the path of the readings.
 
     Returns: READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv, and the same
     of READINGS-path.csv; READINGS-targets.csv if there are targets in the ground.

@@ -94,7 +94,7 @@ class _LaterMeans:
     counts: FloatArray  # (n,): number that are known
 
     def mean_square(self, up: FloatArray, *, offline: bool) -> FloatArray:
-        """Return the mean squared angle (n,) to a direction up (n, 3), of the rows so far; offline, of all rows."""
+        """Return the mean squared angle (n,) to a direction up (n, 3), over the rows so far; offline, over all rows."""
         square = np.sum((self.unit - up[self.began]) ** 2, axis=1)
         errors = np.cumsum(np.bincount(self.ends, square, len(up))) / np.maximum(self.counts, 1.0)
         return np.full(len(errors), errors[-1]) if offline else errors

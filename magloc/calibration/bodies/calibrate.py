@@ -204,7 +204,7 @@ def _sensor_deviations(array: SensorArray, prior: CalibrationPrior) -> FloatArra
 def _poses(
     array: SensorArray, body: MagnetBody, rows: Readings, truth: Truth | None, free_rows: bool
 ) -> tuple[BoolArray, dict[str, Any]]:
-    """Return which rows are used, and their measured poses in the array's frame; those of the rest where unknown."""
+    """Return which rows are used, and their measured poses in the array's frame; the pose at rest where unknown."""
     n = len(rows)
     position, sigma = np.tile(_rest_position(array, body), (n, 1)), np.full((n, 2), np.inf)
     R = np.tile(np.eye(3), (n, 1, 1))

@@ -105,7 +105,7 @@ class BodyProblem(SensorProblem[BodyState]):
 
     @property
     def field_doubt(self) -> float:
-        """Relative error of the field that the prior allows, that of the magnets included."""
+        """Relative error of the field that the prior allows, including errors of the magnets."""
         displaced = 3.0 * self.magnet_prior[:, PLACE].max() / self.array.circumradius
         return float(np.hypot(super().field_doubt, np.hypot(displaced, self.magnet_prior[:, STRENGTH].max())))
 

@@ -285,7 +285,7 @@ class Fixes(Result, Sequence[Fix]):
         return self._edges[:-1]
 
     def replaced(self, rows: IntArray, fixes: Sequence[Fix]) -> Fixes:
-        """Return the fixes with those of some rows replaced."""
+        """Return the fixes with some rows replaced."""
         kept = self.solutions.select(~np.isin(self.solutions.of_row, rows))
         come = Solutions.of(
             [(int(row), solution) for row, fix in zip(rows, fixes, strict=True) for solution in fix.solutions]

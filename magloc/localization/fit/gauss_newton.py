@@ -100,7 +100,7 @@ class JointFits:
         return kept
 
     def with_opposite_moments(self, n_rows: int) -> JointFits:
-        """Return the fits of n rows, each followed by that of the opposite moments."""
+        """Return the fits of n rows, each followed by the fit of the opposite moments."""
         both = np.repeat(np.arange(len(self.q)).reshape(n_rows, -1), 2, axis=1).ravel()
         fits = self.rows(both)
         fits.mu[1::2] *= -1.0

@@ -262,7 +262,7 @@ def rows_of(tiled: TiledSurvey, decision: Exclude) -> BoolArray:
 
 
 def _completed(decision: Decision, numbers: dict[str, Any]) -> Decision:
-    """Return a decision with its time and its numbers; those of a log stay."""
+    """Return a decision with its time and its numbers; a decision from a log keeps its own."""
     return msgspec.structs.replace(decision, when=decision.when or now(), numbers=decision.numbers or numbers)
 
 

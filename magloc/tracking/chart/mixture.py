@@ -200,7 +200,7 @@ def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def mixture_moments(weight: FloatArray, mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return mean (n,) and covariance (n, n) of a mixture with weights (K,), by those of its components."""
+    """Return mean (n,) and covariance (n, n) of a mixture, from its weights (K,) and components."""
     centre = weight @ mean
     off = mean - centre
     return centre, np.einsum("k,kij->ij", weight, covariance) + (weight[:, None] * off).T @ off

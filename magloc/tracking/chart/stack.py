@@ -253,7 +253,7 @@ class Stack:
         return np.array([row.row.time_s for row in self.rows])
 
     def _root_of_means(self, T: FloatArray) -> FloatArray:
-        """Return the root (means, means) of the means' covariance, from that of rows (n, n)."""
+        """Return the root (means, means) of the means' covariance, from the rows' root (n, n)."""
         covariance = np.add.reduceat(np.add.reduceat(T, self._first_rows, axis=0), self._first_rows, axis=1)
         covariance /= np.outer(self._row_counts, self._row_counts)
         value, axes = np.linalg.eigh(covariance)

@@ -90,7 +90,7 @@ class Undetermined:
 
 
 def _moves_a_source_at_rest(motion: MotionModel) -> bool:
-    """Return True if a source at rest moves in the state's frame, that of a moving array."""
+    """Return True if a source at rest moves in the state's frame, because the array moves."""
     x, _ = motion.start(np.arange(1.0, 1.0 + N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
     return not np.allclose(motion.step(x, 1.0)[0], x, rtol=1e-9)
 

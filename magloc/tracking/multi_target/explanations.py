@@ -404,7 +404,7 @@ def drop_duplicates(found: Iterable[Explanation]) -> list[Explanation]:
 
 
 def drop_same_places(found: Iterable[Explanation]) -> list[Explanation]:
-    """Return explanations, the likeliest first; of those with the same sources only the likeliest."""
+    """Return explanations, the likeliest first, with at most one for each set of sources."""
     unique: list[Explanation] = []
     for one in sorted((one for one in found if np.isfinite(one.score)), key=_score):
         if not any(are_same(one.update.state, other.update.state) for other in unique):

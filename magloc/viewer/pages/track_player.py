@@ -189,7 +189,7 @@ class TrackPlayer(TimePlayer):
             self.tail_slider = gui.add_slider(
                 "Tail [s]", 0.0, longest, self.step_s, longest, disabled=still, hint="length of the tail"
             )
-            self.whole_checkbox = gui.add_checkbox("Whole track", True, hint="a thin line, of all times")
+            self.whole_checkbox = gui.add_checkbox("Whole track", True, hint="a thin line, for all times")
         with gui.add_folder("At this time"):
             self.row_panel = gui.add_html("")
         self.row_buttons.on_click(lambda _: self._step_row(1 if self.row_buttons.value == "next" else -1))

@@ -11,7 +11,7 @@ from arrays.typing import IntArray
 
 
 def rows_of_change(states: Sequence[Hashable]) -> IntArray:
-    """Return the rows whose state differs from that of the previous row."""
+    """Return the rows whose state differs from the previous row's."""
     return np.array([i for i in range(1, len(states)) if states[i] != states[i - 1]], dtype=np.intp)
 
 

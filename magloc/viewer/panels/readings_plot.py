@@ -99,7 +99,7 @@ class ReadingsPlot:
             self.kind_dropdown = gui.add_dropdown(
                 "Show",
                 (RAW, DIFFERENCES) if residuals_T is None else (RAW, DIFFERENCES, RESIDUALS),
-                hint="Differences are of the field in the array's axes, from the mean of the sensors with a reading.",
+                hint="Differences of the field in the array's axes from the mean of the sensors with a reading.",
             )
             self.lines_panel = gui.add_html("")
             self.cursor_panel = gui.add_html("")
@@ -214,7 +214,7 @@ class ReadingsPlot:
         return 1e9 * differences_from_mean(self._array, values_T)
 
     def _thin_lines(self, kind: str, selection: tuple[int, ...], span_s: float, page: int) -> PlotLines:
-        """Return lines in the resolution of the plot, of one page if there is a span."""
+        """Return lines in the resolution of the plot, for one page if there is a span."""
         values, time_s = self._values_nT(kind)[:, selection], self._time_s
         ends = (float(time_s[0]), float(time_s[-1])) if self._window_s is None else (-self._window_s, 0.0)
         span = span_of(values)
