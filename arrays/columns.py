@@ -43,7 +43,7 @@ class ValidRows:
     column : str
         Name of a column of numbers.
     equals : tuple of float
-        Values of rows that count; rows with another value, or without one, have no reading.
+        Values of valid rows; rows with another value, or without one, have no reading.
 
     Examples
     --------
@@ -130,7 +130,7 @@ class LogColumns:
         Instead of `quaternion`: columns of yaw, or of yaw, pitch and roll [deg], from north, east, down to forward,
         right, down. The array's axes are forward, left, up. Without an attitude they are the axes of the world.
     course : bool
-        In place of an attitude: the array's x axis points along the course over ground. Files only.
+        Instead of an attitude: the array's x axis points along the course over ground. Files only.
     pose_latency_s : float
         Time by which the pose of a row is older than its readings [s].
     dummy : tuple of float and str

@@ -58,7 +58,7 @@ def run_many(
     judge : callable, optional
         Takes the simulation and what the estimator returned, and gives a mapping of names to numbers, or to arrays of
         numbers of the same shape for all seeds. By default: a mapping itself; the angle between an
-        attitude and the truth (``error_deg``); of other results the numbers of ``result.consistency(truth)``.
+        attitude and the truth (``error_deg``); for other results the numbers of ``result.consistency(truth)``.
     processes : int, optional
         Number of processes; by default that of the processors, at most that of the seeds, and 1 for an estimator that
         cannot be pickled, such as a lambda. The result does not depend on it. 1 runs in the calling process.

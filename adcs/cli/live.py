@@ -45,7 +45,7 @@ def live(
     lag_s : float
         Lag of the magnetometer behind the gyro [s], at most 0.04; adcs.AttitudeConfig.from_log measures it.
     replay_speed : float
-        Speed of a replay, over that of the recording.
+        Speed of a replay, relative to the recording.
     page : PageOptions
         Page that shows attitude, σ and disturbance.
     common : QuietOptions

@@ -32,7 +32,7 @@ def loads(
     Each switch is a step in the readings, and the gyro measures how the satellite turns meanwhile. The command needs no
     model of the Earth's field. If states and readings have different clocks, a warning states the lag, and the fields
     are corrected for it. With three magnetometers or more the command also locates every load as a dipole, which
-    identifies it and gives its torque. It subtracts the estimated field, not that of the dipole.
+    identifies it and gives its torque. It subtracts the estimated field, not the dipole's.
 
     Parameters
     ----------

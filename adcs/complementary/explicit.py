@@ -93,7 +93,7 @@ class Gains:
 
     @property
     def largest_kp_per_s(self) -> float:
-        """Larger one of both K_P, times the larger weight."""
+        """The larger K_P times the larger weight."""
         return max(self.kp_per_s, self.during(outage=True)[0]) * max(self.first_weight, self.second_weight)
 
     def check(self, dt_s: float) -> None:

@@ -159,9 +159,9 @@ def inertial_magnetic_filter(
         Readings in body axes, NaN where missing; at rest the acceleration is upwards. Within a gap of the gyro, σ grows
         by the possible rotation of a hand. Without a magnetometer the field is None, or NaN everywhere.
     magnet : str
-        Treatment of a field that contradicts the filter. ``rejected`` ignores it. ``subtracted`` subtracts it as that
-        of a magnet that moves with the sensor. ``auto`` ignores it until rotations show that it moves with the sensor,
-        and then subtracts it. ``kept`` uses all readings.
+        Treatment of a field that contradicts the filter. ``rejected`` ignores it. ``subtracted`` subtracts it, as the
+        field of a magnet that moves with the sensor. ``auto`` ignores it until rotations show that it moves with the
+        sensor, and then subtracts it. ``kept`` uses all readings.
     gyro_samples : str
         Kind of a sample, as in :func:`adcs.complementary_filter`.
     offline : bool

@@ -59,8 +59,8 @@ class HeadingModel:
     turning_rad_s : float
         Smallest rate of a sensor in motion; below it, neither the room's field nor the drift changes.
     gap_rad_s, long_gap_rad_s : float
-        Standard deviation of the mean rate within a gap of the gyro against that of its ends, in a short gap and in one
-        beyond a second; the rms rate of the whole log replaces the latter if it is higher.
+        Standard deviation of the mean rate within a gap of the gyro relative to the mean at its ends: in short gaps,
+        and in gaps beyond a second. The rms rate of the whole log replaces the latter if it is higher.
     jump_T : float
         Standard deviation of the field of a magnet, each axis.
     gate, mean_nis, memory : float

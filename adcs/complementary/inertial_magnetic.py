@@ -261,8 +261,9 @@ def prepare(
 ) -> PreparedReadings:
     """Remove bias, lag and motion from a record; see :class:`PreparedReadings`.
 
-    Each instant uses the readings up to it, offline the whole record. The lag always uses the whole record. Not offline
-    it is the reference, with :func:`adcs.complementary.heading.heading_track`, for :class:`adcs.AttitudeFilter`.
+    Each instant uses the readings up to it, offline the whole record. The lag always uses the whole record. Without
+    `offline` it is the reference, with :func:`adcs.complementary.heading.heading_track`, for
+    :class:`adcs.AttitudeFilter`.
     """
     motion = RecordMotion.of(record, model)
     time_s, dt_s, rate, q_gyro = record.time_s, record.dt_s, motion.rate_rad_s, motion.q_gyro

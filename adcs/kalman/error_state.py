@@ -169,8 +169,8 @@ class FilterSettings:
     noise : ProcessNoise
         Process noise of a usual step.
     field_error_T : float
-        Standard deviation of each component of the field model's error. It is added to the magnetometer's noise, or is
-        that of the state ``field-model``, with :data:`FIELD_ERROR_T` instead of 0.
+        Standard deviation of each component of the field model's error. It is added to the magnetometer's noise. With
+        the state ``field-model`` it is the state's, and 0 means :data:`FIELD_ERROR_T`.
     field_correlation_s : float
         Time constant of the state ``field-model``; 1,000 km of a low orbit.
     disturbance_correlation_s : float

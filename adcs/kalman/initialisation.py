@@ -8,7 +8,7 @@ most likely innovations is chosen (:func:`any_start`).
 
 A magnetometer alone also leaves the rate about the field and the torques open. A filter with a large deviation of the
 rate diverges if the satellite is nearly at rest; one with a small deviation diverges if it tumbles. Both are tried.
-Then all angles start again from the torques and the dipole at the end of the best filter, as long as that improves the fit.
+Then all angles start again from the torques and the dipole at the end of the best filter, as long as the fit improves.
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ def torque_scale(inertia_kgm2: ArrayLike | None) -> float:
 def tuned_noise(used: SensorSet, inertia_kgm2: ArrayLike | None = None) -> ProcessNoise:
     """Return process noise that makes the filter accurate and consistent.
 
-    It is tuned for a constant torque of 8e-7 N·m; with the state ``dipole`` and without ``disturbance``, for one of up
-    to 1e-8 N·m besides that of the dipole. ``inertia_kgm2`` (3, 3): small satellites accelerate more by such torques.
+    It is tuned for a constant torque of 8e-7 N·m; with the state ``dipole`` and without ``disturbance``, for a torque
+    of up to 1e-8 N·m besides the dipole's. ``inertia_kgm2`` (3, 3): small satellites accelerate more by such torques.
     """
     scale = torque_scale(inertia_kgm2)
     if "dipole" in used.states:

@@ -103,7 +103,7 @@ class SatelliteFilter:
     step_s : float
         Usual time between updates, to which the process noise refers. Longer steps are divided into such ones.
     horizon_s : float
-        Largest delay of a reading. The filter keeps its states for so long, and repeats the updates after a late
+        Largest delay of a reading. The filter keeps its states for this time, and repeats the updates after a late
         reading.
 
     Raises
@@ -172,7 +172,7 @@ class SatelliteFilter:
         ----------
         time_s : float
             Time since :attr:`adcs.Satellite.start`, later than the one before, or a late reading's, at most
-            ``horizon_s`` before. Late readings of the time of an update join the others of it. After a gap that is
+            ``horizon_s`` before. Late readings with the time of an update are added to that update. After a gap that is
             longer than ``longest_gap_s`` of the settings, 600 s, the filter starts anew.
         star, star_covariance_rad2, gyro_rad_s, field_T, sun : optional
             Readings as in a row of :class:`adcs.Telemetry`. None, and a reading with a component that is NaN, is
@@ -248,7 +248,7 @@ class SatelliteFilter:
     def state(self) -> dict[str, Any]:
         """Return the state of the filter, for a JSON file and :meth:`from_state`.
 
-        It does not contain earlier states, so readings from before it cannot be late ones after a restart.
+        It does not contain earlier states: after a restart, older readings are refused.
         """
         now = self._progress
         counts = np.array([now.first_s, now.last_s, now.n_taken])

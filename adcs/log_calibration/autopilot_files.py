@@ -30,7 +30,7 @@ Parameters = dict[str, float | int]
 
 
 def px4_parameters(found: LogCalibration) -> Parameters:
-    """Return parameters of PX4; of terms that the log does not determine there are none."""
+    """Return parameters of PX4 for the terms that the log determines."""
     values: Parameters = {}
     for m, series in enumerate(found.log.magnetometers[: _MOST_COMPASSES["px4"]]):
         begin = f"CAL_MAG{m}_"
@@ -55,7 +55,7 @@ def px4_parameters(found: LogCalibration) -> Parameters:
 
 
 def ardupilot_parameters(found: LogCalibration) -> Parameters:
-    """Return parameters of ArduPilot; of terms that the log does not determine there are none."""
+    """Return parameters of ArduPilot for the terms that the log determines."""
     values: Parameters = {}
     for m, series in enumerate(found.log.magnetometers[: _MOST_COMPASSES["ardupilot"]]):
         which = "" if m == 0 else str(m + 1)

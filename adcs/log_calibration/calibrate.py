@@ -173,10 +173,10 @@ def calibrate_log(
 ) -> LogCalibration:
     """Calibrate magnetometers, gyro and accelerometer jointly from a flight or drive.
 
-    The attitude is by the gyro, whose bias, scales and axes are estimated; the accelerometer holds the tilt, and
+    The gyro gives the attitude; its bias, scales and axes are estimated. The accelerometer gives the tilt, and
     accelerations of the vehicle are unknown. The magnetometers turn in a field that is constant in the world. Their
-    noise, slow errors and the random walk of the attitude maximise the likelihood. Parts of the log that
-    fit none of it are excluded and flagged.
+    noise, slow errors and the random walk of the attitude maximise the likelihood. Parts of the log that do not fit
+    this model are excluded and flagged.
 
     Parameters
     ----------

@@ -85,7 +85,7 @@ def fit_log(log: VehicleLog, field: FieldPrior) -> LogFit:
     currents = tuple(series.finite() for series in log.currents)
     for one in magnetometers:
         if len(one.values) and not np.ptp(one.values, axis=0).any():
-            raise ValueError(f"Input {one.name} must have readings that vary; instead all are equal. Leave it out.")
+            raise ValueError(f"Input {one.name} must have readings that vary; instead all are equal. Exclude it.")
     start = find_start(data, magnetometers)
     layout = Layout(tuple(one.name for one in magnetometers), tuple(one.name for one in currents))
     ranges = np.array([one.span for one in currents])
@@ -151,7 +151,7 @@ def _mounting(at: Estimate, m: int, start: FloatArray) -> FloatArray:
 def most_likely_noise(model: LinearModel, noise: Noise, usual: Noise) -> Noise:
     """Return a noise of larger evidence: one step of a search along the logarithm of each of its numbers.
 
-    Their priors are log-normal around usual ones: a short log tells little of slow processes.
+    Their priors are log-normal around usual ones: a short log shows little of slow processes.
     """
 
     def cost_of(each: Noise) -> float:

@@ -64,7 +64,7 @@ class Noise:
     turn_rad_rts : float
         Random walk of the attitude [rad/√s].
     white_uT : ndarray, shape (M,)
-        White noise of a reading; of coloured noise, the white noise with its density at low frequencies.
+        White noise of a reading; for coloured noise, white noise with the same density at low frequencies.
     sigma, time_s : ndarray, shape (2 + M,)
         Standard deviation and correlation time of the slow processes: gyro drift [rad/s], velocity [m/s] and slow field
         errors [µT].
@@ -270,7 +270,7 @@ class Estimate:
     def gyro_turns(self) -> tuple[FloatArray, FloatArray]:
         """Return rotations by unit errors of the gyro's bias and of its matrix, world frame.
 
-        The first ones (K - 1, 3, 9) belong to whole intervals. The second ones (n, 3, 9) belong to each instant
+        The first ones (K - 1, 3, 9) belong to whole intervals. The second ones (n, 3, 9) are the parts at each instant
         that are not linear within its interval.
         """
         data = self.problem.inertial

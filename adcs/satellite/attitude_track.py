@@ -105,7 +105,7 @@ class AttitudeTrack(Result):
 
     @property
     def rejected(self) -> dict[str, BoolArray]:
-        """Masks (n,) of unused readings by sensor: of sensors not in use, and rejected by the gate."""
+        """Masks (n,) of unused readings by sensor: those of sensors not in use, and those that the gate rejected."""
         return {
             name: seen & (self.gated[name] if name in self.gated and name in self.used else name not in self.used)
             for name, seen in self.seen.items()

@@ -1,9 +1,9 @@
 r"""Calibration of a magnetometer from a log and the field along the orbit, with or without the attitude.
 
 The magnetometer reads :math:`z = (E + D)\,b + o + n`. D has nine parameters, with the gains on its diagonal; o is the
-bias. Without an attitude each row measures a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`, with one all of b. All
-parameters have a prior, so that an unobservable one keeps its prior value and deviation. The field is that along the
-orbit at the row's time plus a shift, the last parameter. See docs/theory/attitude-kalman-filters.md.
+bias. Without an attitude each row measures a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`; with an attitude it measures
+all of b. All parameters have a prior, so that an unobservable one keeps its prior value and deviation. The field is
+computed along the orbit at the row's time plus a shift, the last parameter. See docs/theory/attitude-kalman-filters.md.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def calibrate_magnetometer(
     prior : MagnetometerPrior
         Noise, and prior deviations of bias, gains, axes, the model's error and the time shift.
     attitude : str
-        ``none``: the attitude is unknown, and the modulus of each row counts. The modulus does not determine the
+        ``none``: the attitude is unknown, and only the modulus of each row is used. The modulus does not determine the
         rotation of the sensor, only (E + D)(E + D)ᵀ. ``orbital``: the attitude is constant in the orbital frame, and
         unknown there.
 

@@ -22,7 +22,7 @@ _MOST_ANGLE_RAD = math.radians(89.0)
 DISTORTION_DEGREES = np.array([3.0, 5.0, 2.0, 2.0])
 """Degree of each distortion in the place."""
 WIDEST_RAD = math.radians(150.0)
-"""Largest angle between opposite corners; tangents of more are useless."""
+"""Largest angle between opposite corners; tangents of larger angles are useless."""
 
 
 @dataclass(frozen=True)

@@ -214,8 +214,8 @@ class StarMatcher:
     def _checks(self, stars: int, prior: LensPrior) -> Checks:
         """Return the limits of the search.
 
-        The number of matches that ends the search occurs by chance a hundred times less often than accepted, even in a
-        crowded part of the sky.
+        The search ends at a number of matches that chance reaches a hundred times less often than the accepted limit,
+        even in a crowded part of the sky.
         """
         near = _WIDENED * self.gate_rad(self.camera)
         share = self._seen(self.near, self.camera).share
@@ -257,7 +257,7 @@ class StarMatcher:
     ) -> StarFix:
         """Fit the pose to all stars near their places, with the probability of as many by chance.
 
-        ``gates``: those of the first fits, over the usual one.
+        ``gates``: gates of the first fits, relative to the usual one.
         """
         before = np.empty(0, dtype=np.intp)
         for i in range(len(gates) + _REFITS - 1):

@@ -38,7 +38,7 @@ class LensFile(File, kw_only=True):
     tangential: tuple[float, float] = (0.0, 0.0)
     scale_sigma_arcsec: NotNegative
     radial_sigma: NotNegative
-    """Standard deviation of a corner's displacement, as that of k₁."""
+    """Standard deviation of a corner's displacement by k₁."""
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ class BodyLocator:
         return poses
 
     def _bends(self, rows: WhitenedRows, poses: BodyPoses) -> FloatArray:
-        """Return how far readings bend over one standard deviation of the best poses (n,), in units of the noise."""
+        """Return the nonlinearity of readings (n,) over one σ of the best poses, in units of the noise."""
         magnets, _ = placed_magnets(self.body, poses.position_m[:, 0], poses.R[:, 0])
         square_m = np.sum((magnets[:, :, None] - self.array.positions) ** 2, axis=-1).min(axis=(1, 2))
         variance = np.diagonal(poses.covariance[:, 0], axis1=1, axis2=2)
@@ -353,7 +353,7 @@ def _without(body: MagnetBody, index: int) -> MagnetBody:
 
 
 def _widened(poses: BodyPoses, width: int) -> BodyPoses:
-    """Return poses of a given number of places, which may be fewer."""
+    """Return poses with another number of places per row; places are cut or empty."""
     of_places = {name: getattr(poses, name) for name in ("position_m", "R", "covariance", "chi2")}
     n = min(width, poses.chi2.shape[1])
     wide: dict[str, Any] = {name: np.full((len(v), width, *v.shape[2:]), np.nan) for name, v in of_places.items()}

@@ -20,7 +20,7 @@ class RowOptima:
     covariance: FloatArray
 
     def put(self, rows: IntArray | BoolArray, others: RowOptima) -> None:
-        """Write the optima of some rows, of at most as many places."""
+        """Write the optima of some rows; they have at most as many places as these."""
         width = others.chi2.shape[1]
         for values, of_others in zip(vars(self).values(), vars(others).values(), strict=True):
             values[rows] = np.nan

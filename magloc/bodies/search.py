@@ -99,7 +99,7 @@ class PoseTable:
     candidates : ndarray, shape (M, 12)
         Position in radii from the array's centroid, and rotation matrix.
     table : ndarray of float32, shape (C + 1, M)
-        Features of their readings; the last row makes the largest product that of the nearest candidate.
+        Features of their readings; with the last row, the nearest candidate has the largest product.
     """
 
     candidates: FloatArray

@@ -28,7 +28,8 @@ class BodySymmetry:
     rotations : ndarray, shape (g, 3, 3)
         Rotations of the group, the identity first.
     axis : ndarray, shape (3,), optional
-        Axis about which every rotation maps the body to itself; then `rotations` has those that reverse it at most.
+        Axis about which every rotation maps the body to itself; then `rotations` contains only rotations that keep or
+        reverse it.
     """
 
     centre_m: FloatArray

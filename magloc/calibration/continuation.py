@@ -150,7 +150,7 @@ def _relocate_misfits(
 def fit_calibration(problem: Problem, state: State) -> tuple[Problem, Optimum[CalibrationIterate[State]]]:
     """Return the problem with the noise at the optimum, and the optimum near a state.
 
-    If residuals exceed the stated noise, priors count for as much as by the noise that the residuals show.
+    If residuals exceed the stated noise, priors are weighted relative to the noise that the residuals show.
     """
     for _ in range(_NOISE_PASSES if problem.array.noise_fractions.any() else 1):
         problem = inflate_noise(problem, state.sensors, 0.0)

@@ -51,8 +51,8 @@ def eliminate_rows(
 ) -> ReducedEquations:
     """Return the normal equations of sensors and source, with the rows' unknowns eliminated.
 
-    The prior of the rows' unknowns is 1/σ and their deviation from it, (T, n) each. The damping is that of the rows'
-    unknowns, relative to their information.
+    The prior of the rows' unknowns is 1/σ and their deviation from it, (T, n) each. The damping of the rows' unknowns
+    is relative to their information.
 
     With the rows' columns ``J = Q R`` (priors and damping appended as further rows) what remains of the other columns
     is their part orthogonal to Q.

@@ -123,7 +123,7 @@ class ConditioningOptions:
     mains_hz : float
         Frequency to remove, with its harmonics [Hz], such as 50.
     window_s : float
-        Length of the windows to average [s]; by default every row counts.
+        Length of the windows to average [s]; by default rows are not averaged.
     """
 
     rest_s: float | None = None

@@ -69,7 +69,7 @@ class Attitude:
     def of(cls, signal: Signal, noise: float) -> Attitude:
         """Return the attitude of a field with some relative noise in every row.
 
-        A change that noise explains counts as none, because it would seem to determine coefficients.
+        Changes within the noise are ignored, because they would seem to determine coefficients.
         """
         values = signal.samples()[1]
         unit = values / np.linalg.norm(values, axis=1, keepdims=True)
@@ -130,8 +130,8 @@ def platform_moduli(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the effect (n,) of a platform on the modulus of the ambient field, and its derivatives (n, q).
 
-    Coefficients are in units of their priors. With times the ambient field is what the coefficients leave of the
-    reading of the same sensor, and changes with them.
+    Coefficients are in units of their priors. With times, the ambient field is the sensor's own reading without the
+    platform's field, and changes with the coefficients.
     """
     fields = terms.fields(field_T, rate_T_s, currents)
     total = field_T + fields @ coefficients

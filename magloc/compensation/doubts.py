@@ -134,9 +134,9 @@ def _change(fit: PlatformFit) -> tuple[float, float] | None:
 
     A score test: residuals against three components from each of some times on, with all coefficients estimated. The
     background is the likeliest one, so that the residuals are white and the score has the distribution of χ². If it
-    is larger than the usual one, as a step makes it, the usual one is taken. Outliers do not count, because a jump of
-    the background is no step of the platform's field, which varies with the attitude. The residuals' own size is the
-    unit, because those of a survey are larger than the noise.
+    is larger than the usual one, as a step makes it, the usual one is taken. Outliers are ignored: a jump of the
+    background is no step of the platform's field, which varies with the attitude. Residuals are divided by their own
+    size, because in a survey they exceed the noise.
     """
     usual, likeliest = Background.usual(fit.rows.noise_T), fit.background
     is_calm = likeliest.walk_nT_rts <= usual.walk_nT_rts and likeliest.bend_nT_s15 <= usual.bend_nT_s15

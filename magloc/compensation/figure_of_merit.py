@@ -1,8 +1,8 @@
 r"""Figure of merit of a compensation.
 
-The aircraft pitches, rolls and yaws on four headings. The figure is the sum of the twelve amplitudes of the readings,
-peak to peak, that these manoeuvres leave. An amplitude is :math:`2 \sqrt 2` standard deviations of the readings in the
-band of the manoeuvres, as of a sine.
+The aircraft pitches, rolls and yaws on four headings. The figure is the sum of the peak-to-peak amplitudes of the
+readings in these twelve manoeuvres. An amplitude is :math:`2 \sqrt 2` standard deviations of the readings in the band
+of the manoeuvres, as of a sine.
 
 Source: Geological Survey of Canada, "Guide to aeromagnetic specifications and contracts", Open File 2349 (1991).
 """

@@ -4,8 +4,8 @@ The readings are a slow background, the platform's terms and noise,
 
 .. math:: y_i = s_i + |b_i + h_i(c)| - |b_i| + ν_i
 
-The background s is the sum of a random walk and of an integrated one. Their densities and the noise are those of the
-largest evidence, so that the covariance of the coefficients accounts for residuals that are correlated in time.
+The background s is the sum of a random walk and of an integrated one. Their densities and the noise maximise the
+evidence, so that the covariance of the coefficients accounts for residuals that are correlated in time.
 """
 
 from __future__ import annotations

@@ -166,9 +166,9 @@ class DampedFilter(_PriorFilter):
     r"""Levenberg-Marquardt iteration that lowers the cost of :class:`IekfFilter` in each step.
 
     A step solves :math:`(M + \lambda\,\mathrm{diag} M)\,\delta = -\nabla` with :math:`M = H^T R^{-1} H + P_0^{-1}` and
-    the gradient of half the cost. One that lowers the cost is taken and divides the damping λ by 5; any other is not,
-    and multiplies it by 4. Where Gauss-Newton steps wander without end, this one stops at an optimum; a wide prior
-    makes it one of the likelihood.
+    the gradient of half the cost. A step that lowers the cost is accepted and divides the damping λ by 5; any other
+    step is rejected and multiplies λ by 4. Where Gauss-Newton steps do not converge, this iteration stops at an
+    optimum; with a wide prior it is the likelihood's.
 
     Attributes
     ----------

@@ -93,7 +93,8 @@ class SourcesScenario:
         Length of every source. Its multipole moments are random, and count as noise in fixes and bounds. By default a
         quarter of its distance near the array, as in :class:`magloc.Locator`; 0 for points.
     seed : int
-        Seed of the moments' directions and all errors. Those of a source depend only on it and the place in the cube.
+        Seed of the moments' directions and all errors. The draws of a source depend only on the seed and on its place
+        in the cube.
     """
 
     array: SensorArray = field(default_factory=lambda: tetrahedron(1.5, noise_T=1e-9))

@@ -77,7 +77,7 @@ class StartsScenario:
     half_width_m : float
         The cube reaches from -half_width to +half_width along every axis, around the origin of the array's frame.
     noise_seed : int, optional
-        Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
+        Seed of one realisation of the sensors' noise, the same for all starts; without it readings are noise-free.
     """
 
     array: SensorArray = field(default_factory=lambda: tetrahedron(0.45, noise_T=1e-9))
@@ -282,7 +282,7 @@ def convergence_map(
     n : int
         Starts along every axis, at least 2. The moment always starts at zero.
     noise_seed : int, optional
-        Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
+        Seed of one realisation of the sensors' noise, the same for all starts; without it readings are noise-free.
     out : path-like, optional
         Folder of a zarr store for the map. Finished parts that it has are not computed again.
     scheduler : str, optional

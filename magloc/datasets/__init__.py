@@ -27,7 +27,7 @@ class Dataset:
         As its user knows it.
     readings : Readings
     truth : Truth
-        Of the source, in the frame of the results: the world's where the array moves.
+        Truth of the source in the frame of the results, which is the world's if the array moves.
     path : Path
         Of the readings file; NAME-array.toml and NAME-truth.csv stand beside it.
     """

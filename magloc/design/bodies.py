@@ -6,8 +6,9 @@ r"""Optimisation of the magnets of a body, and of the sensors about them, for th
 
 with the largest standard deviation σ_x of the position along any direction, the largest one σ_θ of the rotation about
 any axis, and a lever L: the rotation counts as the displacement of a point at the distance L. The criterion is a
-quantile or the mean of σ over the limits of the body. Shapes and stated errors of magnets and sensors count as in
-``magloc bounds --body``, so the slope of the criterion is by central differences. The descent is as for arrays.
+quantile or the mean of σ over the limits of the body. Shapes and stated errors of magnets and sensors are included as
+in ``magloc bounds --body``; therefore the criterion's slope is computed by central differences. The descent is as for
+arrays.
 """
 
 from __future__ import annotations

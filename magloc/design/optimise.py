@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 BEST_START = "best start"
 NEAR_OPTIMAL = 0.1
-"""Largest gain over a reference that counts as near-optimal."""
+"""Largest gain of a design over a reference that is called near-optimal."""
 # Factor over the criterion above which a σ means a loss of rank.
 _UNBOUNDED = 1e3
 

@@ -20,7 +20,7 @@ _LONGEST_BODY_M = 1e4
 DEFAULT_LENGTH = 0.25
 """Assumed length of a body of unknown length, divided by its distance from the nearest sensor."""
 NEAR, _N_NEAR = 0.6, 4
-"""Distance, in circumradii of the array, and number of sensors: so many must be nearer to assume a default body.
+"""A default body is assumed if this many sensors are nearer than this distance, in circumradii of the array.
 
 A source near a single sensor may be a fault of that sensor.
 """

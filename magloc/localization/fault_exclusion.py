@@ -371,7 +371,7 @@ class _Examination:
     def _plan_searches(
         self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
     ) -> list[dict[frozenset[int], list[int]]]:
-        """Return the rows to search again for each set of sensors to leave out, one set after another.
+        """Return the rows to search again for each set of sensors to exclude, one set after another.
 
         In a small array these are all single sensors and all pairs. In a large one they are the sensors nearest to each
         source and the strongest suspects of the refinements.
@@ -415,7 +415,7 @@ class _Examination:
         return q, self.problem.scaled_moment(q, np.stack([source.moment_Am2 for source in sources]))
 
     def _certain_faults(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
-        """Return sensors that are certainly faulty: the only credible fit leaves them out.
+        """Return sensors that are certainly faulty: the only credible fit excludes them.
 
         In that fit they are clear outliers, and no other sensor would be an outlier even if excluded.
         """

@@ -76,7 +76,7 @@ class Locator:
         Shape of the source, a magnet that is magnetised along its axis; its field is then exact at any distance. A
         cuboid has equal edges across its last one, along which it is magnetised.
     exclude_faulty : bool
-        Leave out sensors that contradict all others, and name them.
+        Exclude sensors that contradict all others, and name them.
     rng : int or numpy.random.Generator
         Seed or generator of random restarts and of the draws for the threshold of another source.
 
@@ -353,7 +353,7 @@ def locate(
     magnet : Shape, optional
         Shape of the source, as for :class:`Locator`.
     exclude_faulty, average : bool
-        Leave out sensors that contradict all others. Average all rows to one fix; array and source must stand still.
+        Exclude sensors that contradict all others. Average all rows to one fix; array and source must stand still.
     rng : int or numpy.random.Generator
         Seed or generator of random restarts and of the draws for the threshold of another source.
     progress : callable, optional

@@ -1,8 +1,8 @@
 """Fit of a magnet of known shape, from the dipoles that fit its readings.
 
-A dipole instead of a magnet that is nearer than a few of its lengths is off by a few hundredths of its distance, which
-serves as a start. From it a damped Gauss-Newton iteration has the exact field. The roll of a cuboid counts as noise,
-linearised at the best fit as in :mod:`magloc.localization.model_errors`.
+If a dipole is fitted to a magnet nearer than a few of its lengths, its place is wrong by a few hundredths of the
+distance. It serves as a start. From it a damped Gauss-Newton iteration has the exact field. The roll of a cuboid counts
+as noise, linearised at the best fit as in :mod:`magloc.localization.model_errors`.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ def fix_residuals(
 
     The unknown field common to all sensors is fitted and removed. The sum of squares of a row is the χ² of its
     solution, so the variance of a fitted channel is slightly below 1. NaN without a reading or a solution, and for
-    sensors that the fix leaves out.
+    sensors that the fix excludes.
     """
     readings = check_rows(array, readings_T)
     used = np.where(fixes.solved[:, None], fixes.used_readings(array, readings), np.nan)

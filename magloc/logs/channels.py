@@ -111,7 +111,7 @@ class Log(Mapping[str, LogChannel]):
     kind : str
         Format, such as "PX4 ULog".
     topics : tuple of Topic
-        Fields that share their times. Two topics of one name are parts of a message whose sensors have own clocks.
+        Fields that share their times. Two topics of one name are parts of a message whose sensors have separate clocks.
     parameters : dict
         Settings of the autopilot by their names, such as ``CAL_MAG0_ROT``; empty for other logs.
     unix_zero_s : float, optional

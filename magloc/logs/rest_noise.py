@@ -40,7 +40,7 @@ class RestNoise:
     tau_s, deviation : ndarray, shapes (m,) and (m, k)
         Averaging times, and the Allan deviation of each axis.
     white : float
-        Standard deviation of a sample; behind a low-pass that of white noise which has the same mean values.
+        Standard deviation of a sample. After a low-pass: of white noise with the same averages.
     flicker : float
         Standard deviation of 1/f noise in every decade of frequency; 0 where the record does not show it.
     walk : float

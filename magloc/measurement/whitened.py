@@ -198,7 +198,7 @@ class WhitenedModel(ScaledSensors):
         flat, unknown = self.shrinkage >= 1.0, self.basis
         bounded = ~flat.all(axis=0)
         if bounded.any():
-            # Columns that no row uses cost time, so leave them out.
+            # Columns that no row uses cost time, so they are omitted.
             with np.errstate(divide="ignore"):
                 variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
             known = (unknown * np.sqrt(variance)[:, None])[..., bounded]

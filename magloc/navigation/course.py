@@ -23,7 +23,7 @@ CHORD_M = 2.0
 def chords(xy_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return the way (n,) [m], the chords (n, 2) that end and that begin at each row, and their length [m].
 
-    Beyond the ends there is no way: a chord there is shorter. Without motion all are zero.
+    At the ends the chord is shorter, because there is no path beyond them. Without motion all are zero.
     """
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
     chord = float(min(CHORD_M, way[-1] / 10.0))

@@ -213,7 +213,7 @@ def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -
 def bound_reach(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     """Draw the largest distances of the required accuracy and of detection, in three planes.
 
-    The polar curves hold for the given moment, and for the median, 95 % and the worst of the moments.
+    The polar curves are for the given moment, and for the median, 95 % and the worst of the moments.
 
     Parameters
     ----------

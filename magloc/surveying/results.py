@@ -257,8 +257,8 @@ class Survey(Result):
     def levelled_rows(self) -> SurveyRows:
         """Rows for maps, without the level of their line (:func:`magloc.surveying.fit.levelling.line_levels`).
 
-        The levels are estimated from the residual, so that targets do not count. The median of the rest is removed from
-        both maps too, because the offset of the anomaly is not that of the ground without targets.
+        The levels are estimated from the residual, so that targets do not affect them. The median of the rest is
+        removed from both maps too, because the offset of the anomaly is not that of the ground without targets.
         """
         level_T = self._levels_T
         level_T = level_T + float(np.median(self.rows.residual_T - level_T))

@@ -116,10 +116,11 @@ class SurveyModel:
         return self.relinearise(fit, background, group) if settled < _SETTLED_COARSELY else (fit, background)
 
     def _misfits(self, fit: JointFit, background: SurveyBackground) -> FloatArray:
-        """Return χ² per reading above each source (K,), or 1 where it is about that or does not count.
+        """Return χ² per reading above each source (K,), or 1 where it is close to 1 or not used.
 
         Where errors are larger than stated, a source has to explain more, as in an F-test. Otherwise each false source
-        would make room for the next. It does not count before the lag is known, which divides a source into two.
+        would make room for the next. It is not used before the lag is known, because an unknown lag splits a source
+        into two.
         """
         if not self.counts_misfits:
             return np.ones(len(fit.sources))

@@ -154,7 +154,7 @@ def normal_equations(
 
 
 def peaks(found: Candidates, threshold: float) -> IntArray:
-    """Return places to start sources from, strongest first, without skirts of stronger peaks."""
+    """Return places to start sources from, strongest first, without the flanks of stronger peaks."""
     order = np.argsort(-found.chi2)
     kept: list[int] = []
     for i in order:

@@ -74,9 +74,10 @@ def survey(
         field varies like it. Without it slow variations are estimated from the survey itself.
     prior : SourcePrior
         Limits of positions in the world frame and of moments; by default from 5 cm to 4 m below the ground, up to 1 m
-        beside the sensors, and up to 300 A·m². With terrain, limits of heights count from the ground.
+        beside the sensors, and up to 300 A·m². With terrain, limits of heights are measured from the ground.
     ground_m : float or Terrain
-        Height of the ground in the world frame [m], or terrain: depths then count from the ground above the target.
+        Height of the ground in the world frame [m], or terrain: depths are then measured from the ground above the
+        target.
     shortest_geology_m : float
         Shortest wavelength in the field of the ground itself [m]; shorter ones count as targets.
     false_per_hectare : float

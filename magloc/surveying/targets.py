@@ -37,7 +37,7 @@ class Profile(NamedTuple):
 def profile_of(model: SurveyModel, fit: JointFit, background: SurveyBackground, which: int) -> Profile:
     """Return the profile of a weak source over its place and moment.
 
-    The others are linear; places weigh by their likelihood.
+    The other sources are linearised; places are weighted by their likelihood.
     """
     record, white = model.record, background.white
     source = fit.sources.some(np.array([which]))

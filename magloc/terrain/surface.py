@@ -42,7 +42,7 @@ class Terrain:
     name : str
         Source of the heights.
     sigma_m : float
-        Standard deviation of the heights below the sensors; intervals of depths count it.
+        Standard deviation of the heights below the sensors; intervals of depths include it.
 
     Raises
     ------

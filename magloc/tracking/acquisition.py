@@ -225,8 +225,8 @@ class CartesianFilter:
         """Return the state at the last of the rows from which a source (6,) at rest was fitted.
 
         `covariance` (6, 6) comes from the fit. A filter passes over the rows from a nearly flat prior, and linearises
-        them at its last result until this converges. So motion between the rows and their common errors of sensors
-        count as in later rows. Return None if it does not converge, or if the rows contradict each other.
+        them at its last result until this converges. Thus motion between the rows and lasting errors of sensors are
+        treated as in later rows. Return None if it does not converge, or if the rows contradict each other.
         """
         if len(rows) == 1 and not self.n_errors:
             return StartState(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)

@@ -190,8 +190,8 @@ def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
     """Return the row of the best known position if the source is at rest, otherwise None.
 
     The source is at rest if χ² of each row's difference from the best one, with both covariances added, is below the
-    0.999 quantile (3 degrees of freedom). Errors of neighbouring rows go together, so that true differences are smaller
-    still. A single row gives None.
+    0.999 quantile (3 degrees of freedom). Errors of neighbouring rows are correlated, so that true differences are even
+    smaller. A single row gives None.
     """
     known = [point for point in points if point.is_on_track and point.covariance is not None]
     if len(known) < 2:

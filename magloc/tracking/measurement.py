@@ -334,8 +334,8 @@ class RowMeasurements:
     def of(self, row: Row, source: FloatArray | None = None) -> RowMeasurement:
         """Return the measurement model of a row.
 
-        Errors of gains and axes act on the field of a source (6,), by default on the readings. Noise of the readings
-        would make them known better than they are: row after row it looks like a field with another gain.
+        Errors of gains and axes act on the field of a source (6,), by default on the readings. With the readings, noise
+        would look like a field with another gain in each row, and σ of the gains would become too small.
         """
         array = self._array
         if row.ambient_T is not None:

@@ -46,7 +46,7 @@ def array_axes_transition(
 
         \dot p = v_{object} - v_{array} - ω_{array} × p, \qquad \dot m = (ω_{object} - ω_{array}) × m
 
-    with all vectors in the array's axes. The paper leaves out the term ω × p, and takes one Euler step; this is
+    with all vectors in the array's axes. The paper omits the term ω × p, and takes one Euler step; this is
     the exact solution for constant rates.
 
     Parameters
@@ -238,9 +238,9 @@ class KnownMotion(_MovingState):
         m_j = m_{j-1} + (ω_{object} - ω_{array}) × m_{j-1} Δt
 
     The step is exact for constant rates. It is in the array's axes; with a known pose it is in the world's, and the
-    array's velocity and rate are zero. The noise is that of :class:`RandomWalk` for the unmeasured rest, and that of
-    the measurements: σ of the velocities moves p, σ of the array's rate turns p and m together, and σ of the object's
-    rate turns m.
+    array's velocity and rate are zero. The noise is the sum of :class:`RandomWalk`'s, for the unmeasured rest, and the
+    measurements': σ of the velocities moves p, σ of the array's rate turns p and m together, and σ of the object's rate
+    turns m.
 
     Attributes
     ----------

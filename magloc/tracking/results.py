@@ -66,7 +66,7 @@ class TrackPoint:
     rivals : tuple of Solution
         Other solutions of the rows, if a track starts from several rows.
     centroid_m : ndarray, shape (3,), optional
-        Centroid of the sensors, from which the range counts.
+        Centroid of the sensors, from which the range is measured.
     radius_m : float
         Largest distance of a sensor from it.
     lag1 : float

@@ -38,7 +38,7 @@ _TURNING_NOISE = 15
 _ROWS_A_CALL = 1000
 """Rows of trajectories that one call of the kernel smooths: some 10 ms."""
 _FOLLOWED = 1e-3
-"""Added variance of residuals in the test of sensors, so that a reading that the fit follows exactly does not count."""
+"""Added variance of residuals in the test of sensors, so that a reading that the fit follows exactly has no weight."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ _LOG = logging.getLogger(__name__)
 SENSOR_LIMIT = 32.0
 """χ² of a sensor's residual above which it contradicts the others (3 degrees of freedom, probability 5e-7)."""
 RIVAL_WITHIN = 9.0
-"""Least difference of χ² between leaving out a sensor and leaving out any other, for which it is at fault."""
+"""Least difference of χ² between excluding a sensor and excluding any other, for which it is at fault."""
 ROWS_TO_DIE = 3.0
 """Rows in which a sensor is excluded before it counts as dead, so that single spikes do not count."""
 ROWS_TO_RETURN = 50

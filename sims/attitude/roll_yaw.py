@@ -1,7 +1,7 @@
 """Truth of the roll/yaw satellite: the error dynamics alone, and the attitude loop.
 
-:mod:`adcs.ellipsoids.roll_yaw` has the system, and the observers that read what is made here. Every run has its own
-stream of random numbers: run s is the same whatever runs are beside it.
+:mod:`adcs.ellipsoids.roll_yaw` has the system and its observers. Every run has its own
+stream of random numbers: run s does not depend on the other runs.
 """
 
 from __future__ import annotations

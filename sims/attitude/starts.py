@@ -16,7 +16,7 @@ from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.noise import stream
 
 GRID_S = 10.0
-"""Conditions are checked at instants this far apart, so that they may be missed by what changes in 10 s."""
+"""Step of the instants at which conditions are checked; shorter changes may be missed."""
 
 
 def starts(scenario: AttitudeScenario, seeds: list[int]) -> Instants:

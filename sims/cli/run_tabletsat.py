@@ -117,7 +117,7 @@ def run_attitude(
 
     Errors are the rms of the last minute per axis, averaged over the runs, of the worst axis. A run with an error of
     more than 10° then has diverged. The largest error while a sensor is degraded or a state is not observable (an
-    eclipse, Sun and field on one line) is that of all runs, after their first minute. --out writes figures, and
+    eclipse, Sun and field on one line) is over all runs, after their first minute. --out writes figures, and
     telemetry.csv and scenario.toml for `adcs estimate`.
 
     Parameters

@@ -11,7 +11,7 @@ from magloc.chi_square import normalised_square
 from sims.attitude.simulation import AttitudeRuns
 
 LAST_S = 60.0
-"""Duration at the end of a run over which errors count [s]."""
+"""Duration at the end of a run over which errors are evaluated [s]."""
 DIVERGED_DEG = 10.0
 """Error in the last minute beyond which a run has diverged."""
 

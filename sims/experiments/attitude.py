@@ -45,7 +45,7 @@ class Outcome:
     axis_rms : ndarray, shape (runs, 30)
         Rms over the last minute of the angle [°], the rate [°/s], the gyro's bias [°/s], the field's bias [nT], the
         disturbance [1/s²], the error of the field's model [nT] and the dipole [A·m²], three axes each, and nine gains
-        of the magnetometer [%]; NaN of a state that the filter does not have.
+        of the magnetometer [%]; NaN for a state that the filter does not have.
     nees : ndarray, shape (runs, n)
         NEES per dimension, at all instants or at those of the last minute.
     nis : ndarray, shape (runs, n, 4)

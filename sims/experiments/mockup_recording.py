@@ -79,7 +79,7 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
     Returns
     -------
     RecordRun
-        Estimates through time, and what became of every fix.
+        Estimates through time, and the outcome of every fix.
 
     Raises
     ------

@@ -98,8 +98,8 @@ class Platform:
     noise_T : float
         White noise per axis and sample in the array's frame, the same at all sensors.
     induced, eddy_s : float
-        Standard deviation of every component (3, 3), of each sensor, of what the ambient field induces in the platform,
-        over that field, and over its derivative in the array's axes. The nominal array states them.
+        Standard deviation of each component (3, 3), at each sensor, of the field induced in the platform, per ambient
+        field, and per its derivative in the array's axes. The nominal array states them.
     """
 
     position_m: Vector = _ZERO
@@ -119,7 +119,7 @@ class Missing:
     dropout : float
         Probability that a sensor misses a sample, all its axes together.
     gaps_s : tuple of pairs
-        Times from which to which there are no rows at all.
+        Begin and end of each span without rows.
     """
 
     dropout: float = 0.0

@@ -310,7 +310,7 @@ def perimeter_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, 
 def _firings(way: float, along_m: float, heading: float, turns: FloatArray) -> FloatArray:
     """Return accelerations along body x and y in every step, in which the satellite turns by ``turns``.
 
-    Table axes are complex numbers. The controller knows where it is, but for rates that change within its step.
+    Table axes are complex numbers. The controller knows the true state, except changes of the rates within its step.
     """
     position, velocity = _on_perimeter(along_m)[0], 0j
     firings = np.zeros((len(turns), 2))

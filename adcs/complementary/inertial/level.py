@@ -24,7 +24,7 @@ from arrays.typing import BoolArray, FloatArray
 GRAVITY_TIME_S = 3.0
 """Longest time constant of the low-pass of the acceleration, as published for VQF."""
 TILT_FLOOR_RAD = math.radians(0.4)
-"""Least σ of the tilt; a shorter time constant has to gain more."""
+"""Least σ of the tilt; a shorter time constant is used only if it gains more than this."""
 _TIMES_S = (GRAVITY_TIME_S, 1.5, 0.7)
 _PREDICTED_S = 2.0  # time over which the mean acceleration is predicted
 _GRAVITY_M_S2 = 9.81

@@ -106,9 +106,9 @@ def check_turns(
     """Raise ValueError if one misreading of a sensor or of the time explains why the turns contradict each other.
 
     The rotations of gravity and field in body axes are compared with the gyro's over windows with rotations of 15 to
-    30°. A change counts if it removes three quarters of a disagreement, makes no other one worse, and improves so many
-    windows that chance does so once in 50,000 times. With 120 changes, that last rule alone refuses fewer than one
-    right log in 400. A log that rotates too little shows nothing.
+    30°. A change counts if it removes three quarters of a disagreement, makes no other one worse, and improves more
+    windows than chance does once in 50,000 times. With 120 changes, that last rule alone refuses fewer than one right
+    log in 400. A log that rotates too little shows nothing.
     ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``acceleration_m_s2``, ``field_T`` (n, 3): NaN
     without a reading. ``hidden`` (n,): instants within a gap of the gyro.
     """
@@ -166,7 +166,7 @@ def _thin(rows: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _windows(time_s: FloatArray, v: FloatArray, gaps: NDArray[np.intp], turn_rad: float) -> _Windows:
-    """Return the shortest consecutive windows of which a quarter turns enough; none if there are few."""
+    """Return the shortest consecutive windows such that a quarter of them turn enough; none if there are few."""
     rows = np.flatnonzero(is_read(v))
     rows = rows[:: instants_within(_SAMPLE_S, time_s[rows])]
     units = v[rows] / np.linalg.norm(v[rows], axis=1, keepdims=True)

@@ -155,8 +155,8 @@ def predict(
     """Return state and covariance after each of some samples, :math:`F P F^T + Q`.
 
     Shapes ``x`` (10,), ``P`` (10, 10) -> (n, 10), (n, 10, 10). ``steps_s`` (n,). ``readings`` (n, 3): accelerations
-    along body x and y, and the rate. ``there`` (n, 3): accepted readings; a rejected acceleration counts as zero, a
-    rejected rate as given. ``densities`` (7,): see :attr:`DelayedFilterSettings.densities`.
+    along body x and y, and the rate. ``there`` (n, 3): mask of accepted readings. A rejected acceleration is replaced
+    by zero, a rejected rate is used as given. ``densities`` (7,): see :attr:`DelayedFilterSettings.densities`.
     """
     h, z, use = np.asarray(steps_s), np.asarray(readings, dtype=np.float64), np.asarray(there, dtype=np.bool_)
     # The gyro's zero and the drifts are constant, so headings, zeros, velocities and positions are cumulative sums.

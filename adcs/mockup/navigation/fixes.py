@@ -160,7 +160,7 @@ class Fused:
     Attributes
     ----------
     track : PlanarTrack
-        Estimate at the end of each sample; a fix that arrives just then counts from the next sample on.
+        Estimate at the end of each sample; a fix that arrives just then is used from the next sample on.
     outcomes : tuple of FixOutcome
         Outcome of each fix, in the order of arrival.
     """

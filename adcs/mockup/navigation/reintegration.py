@@ -14,7 +14,7 @@ from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, Plana
 from arrays.typing import FloatArray
 
 VelocityRule = Callable[[PlanarFix, PlanarFix, ImuRecord], FloatArray]
-"""Velocity (2,) at the exposure of the second fix, of two fixes and the samples between them."""
+"""Velocity (2,) at the exposure of the second of two fixes, from both and the samples between them."""
 
 
 def finite_difference(first: PlanarFix, second: PlanarFix, imu: ImuRecord) -> FloatArray:

@@ -24,7 +24,8 @@ def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: 
     r"""Integrate twice from rest, :math:`\sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`, in O(n).
 
     ``begin_s``: beginning of the first interval. ``time_s`` (n,): end of each interval. ``values`` (..., n): constant
-    over each interval. ``at_s`` (k,): times within the record; the last interval counts up to them. Returns (..., k).
+    over each interval. ``at_s`` (k,): times within the record; the last interval is integrated up to them. Returns
+    (..., k).
     """
     t = np.asarray(time_s, dtype=np.float64) - begin_s
     u = np.asarray(values, dtype=np.complex128)

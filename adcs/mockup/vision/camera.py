@@ -17,7 +17,7 @@ from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 
 REFERENCE_RADIUS_PX = 320.0
-"""Radius at which the distortion of a light over its distance from the optical centre is k1."""
+"""Radius at which the distortion, relative to the distance from the optical centre, is k1."""
 _LARGEST_K1 = 1e6
 FLIP = np.array([1.0, -1.0])  # rows of an image count downwards, centred pixels upwards
 _NO_LENS = 1e-17  # a smaller distortion is below rounding, and the closed form of the inverse would overflow

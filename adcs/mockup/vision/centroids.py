@@ -101,9 +101,9 @@ def find_stars(frame: ArrayLike) -> Stars:
 def find_faint_stars(frame: ArrayLike) -> Stars:
     """Detect lights above six standard deviations of the background in sums of 3 × 3 pixels.
 
-    As :func:`find_stars`, but for sums of each pixel and its eight neighbours. A light that moves over
-    24 pixels is as weak as noise and breaks into pieces, but its sums do not. At rest centroids are better too, because
-    less of the light is below the threshold. A hot pixel has nine sums, so a star needs more.
+    As :func:`find_stars`, but for sums of each pixel and its eight neighbours. A light that is smeared over 24 pixels
+    is as weak as noise and breaks into pieces; in the sums it does not. At rest centroids are better too, because less
+    of the light is below the threshold. A hot pixel has nine sums, so a star needs more.
     Shape ``frame`` (height, width). Intensities, background and threshold refer to the sums.
     """
     image = check_frame(frame).astype(np.uint16)

@@ -207,7 +207,7 @@ def longest_close_subset(points: ComplexArray, closeness: float) -> IntArray:
     """Return a large subset of points within a distance of one another, by a greedy search.
 
     For each point in turn, the other points are added in order of their distance if they are close to all added ones.
-    ``points`` (c,): x + iy. Returns (k,): indices of the longest subset; of equally long ones, that around the point
+    ``points`` (c,): x + iy. Returns (k,): indices of the longest subset; of equally long ones, the one around the point
     with most neighbours.
     """
     distance = np.abs(points[:, None] - points)

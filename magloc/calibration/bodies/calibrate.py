@@ -128,7 +128,7 @@ def calibrate_body(
     body_prior : BodyPrior
         Uncertainty of the nominal body.
     validate : bool
-        Leave rows out in turn, to say how well the calibration carries over.
+        Hold rows out in turn, to test the calibration on rows that it did not use.
 
     Returns
     -------

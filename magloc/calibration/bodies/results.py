@@ -74,7 +74,7 @@ class BodyCalibration(Calibration):
     far_from_prior : tuple of str
         Sensors and magnets whose change is beyond five standard deviations of the prior: dead, exchanged, or reversed.
     cross_validation : PoseErrors, optional
-        How well the calibration carries over to other rows; None where rows are too few.
+        Errors in rows that the calibration did not use; None where rows are too few.
     """
 
     nominal_body: MagnetBody

@@ -191,7 +191,7 @@ def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
 
 
 def _validation_note(errors: PoseErrors) -> str:
-    """Return a note on how well the calibration carries over to other rows."""
+    """Return a note on the errors in rows that the calibration did not use."""
     text = f"cross-validation: rows held out of the calibration have χ² {errors.chi2:.4g} with {errors.dof:.0f} dof"
     if not errors.error_m.size:
         return text

@@ -169,7 +169,7 @@ def _validated(
 
 
 def _validation_notes(validation: CrossValidation, background: str | None) -> list[str]:
-    """Return notes on how well the calibration carries over to other rows."""
+    """Return notes on the errors in rows that the calibration did not use."""
     numbers = validation.json
     if not numbers["rows"]:
         return ["cross-validation: no row that was held out can be located; the calibration fits no other rows"]

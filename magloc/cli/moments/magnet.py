@@ -23,8 +23,8 @@ class MagnetOptions:
     Parameters
     ----------
     kind : {"cuboid", "cylinder", "ring", "sphere"}
-        Shape of the magnet, which is magnetised along its axis: that of a cylinder or ring, the last edge of a cuboid,
-        whose other two edges are equal. Needs --size-m.
+        Shape of the magnet, which is magnetised along its axis: the axis of a cylinder or ring, or the last edge of a
+        cuboid whose other two edges are equal. Needs --size-m.
     size_m : list of float
         Sizes of --magnet [m]: three edges of a cuboid; diameter and height of a cylinder; inner and outer diameter and
         height of a ring; diameter of a sphere.

@@ -33,8 +33,8 @@ def signature(
     """Separate the permanent and the induced moment of a ship that passes on known courses.
 
     In the ship's axes forward, left, up (x, y, z) the moment is the sum of a permanent moment, of the moment that the
-    ambient field induces, and of that of eddy currents while the ship turns. The command names the parts
-    that the headings do not separate, and warns of readings that the model does not explain.
+    ambient field induces, and of a moment of eddy currents while the ship turns. The command names the parts that the
+    headings do not separate, and warns of readings that the model does not explain.
 
     Parameters
     ----------

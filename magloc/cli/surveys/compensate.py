@@ -62,9 +62,9 @@ def compensate(
     """Remove the field of the aircraft, drone or vehicle that carries the sensors.
 
     Estimates its permanent field, its induced field, its eddy currents (Tolles and Lawson) and the fields of measured
-    currents, at every sensor. Fly four headings with pitch, roll and yaw on each, high above the ground. The attitude
-    is that of a vector sensor, or of the pose. The table shows each coefficient with its standard deviation; "not
-    determined" = the flight does not show the term, and σ is that of its prior. The figure of merit is the sum of the
+    currents, at every sensor. Fly four headings with pitch, roll and yaw on each, high above the ground. A vector
+    sensor, or the pose, gives the attitude. The table shows each coefficient with its standard deviation; "not
+    determined" = the flight does not show the term, and σ is the prior's. The figure of merit is the sum of the
     amplitudes, peak to peak, of up to twelve manoeuvres.
 
     Parameters

@@ -36,8 +36,8 @@ class SurfaceOptions:
     terrain : str
         Heights of uneven ground: a GeoTIFF (.tif) in any coordinate system, a CSV file with columns x, y, height or
         easting, northing, height or longitude, latitude, height, or the name of the log's column with the height above
-        ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, then count
-        from the ground.
+        ground [m] from an altimeter. It must cover all lines. Depths, and limits of heights in --region, are then
+        measured from the ground.
     terrain_sigma_m : float
         Standard deviation of the heights of the ground below the sensors [m]. Intervals of depths include it.
     """
@@ -56,7 +56,7 @@ class SurfaceOptions:
     ) -> tuple[float | Terrain, list[Readings], Vector | None]:
         """Return the ground with its error, the readings in the world frame, and its origin.
 
-        If heights of the log count from the ground, the terrain gives the heights of the readings, and of an origin
+        If heights of the log are above the ground, the terrain gives the heights of the readings, and of an origin
         without one.
         """
         ground, parts, origin = self._surface(logs, parts, array, origin)

@@ -416,7 +416,7 @@ typedef struct {
   const double *steps;                     /* (n_rows, 2, 5) of position and rotation: time that the rate lasts, share
                                               that is left of it, and lower roots (00, 10, 11) of the noise */
   const double *nis_limits;                /* (n_rows) above which a row contradicts the track */
-  const double *curvature;                 /* (n_rows) weight of what the linearisation leaves out, in the noise */
+  const double *curvature;                 /* (n_rows) weight of what the linearisation neglects, in the noise */
   double *pose, *rates, *errors;           /* (12), (6), (errors): the state before the next row, changed by calls, */
   double *covariance;                      /* (n, n) */
   int64_t *progress;                       /* (2) contradictions in succession, and 1 as long as the track continues */

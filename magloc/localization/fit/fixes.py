@@ -191,7 +191,7 @@ class Fixes(Result, Sequence[Fix]):
         return result
 
     def used_readings(self, array: SensorArray, readings_T: FloatArray) -> FloatArray:
-        """Return readings (n, C) with NaN for the sensors that each row leaves out."""
+        """Return readings (n, C) with NaN for the sensors that each row excludes."""
         rows = [row for row, names in enumerate(self.dropped_sensors) if names]
         if not rows:
             return readings_T

@@ -6,7 +6,7 @@ threshold is the larger one of two values: the penalty of the Bayesian informati
 noise alone reaches in one of a thousand rows, simulated for the array. A plain χ² test would be wrong, because the best
 of many positions is compared, and without a source its position has no meaning. While the best fit with the largest
 number of sources is not credible, random sources are replaced by others. At the end each source is removed in turn,
-and stays out if the fit is as good without it.
+and is dropped if the fit is as good without it.
 """
 
 from __future__ import annotations
@@ -262,7 +262,7 @@ class _Levels:
         """Return the decrease of χ² that another source needs.
 
         It is the larger one of BIC's penalty and of the decrease that noise reaches in one of a thousand rows. Noise is
-        drawn around the best fit of all rows. Only the draws of which a candidate explains most are searched for a
+        drawn around the best fit of all rows. Only the draws with the highest scores of candidates are searched for a
         second source. These are many more than exceed the threshold, because the grid of candidates is coarse.
         """
         beam = self.one

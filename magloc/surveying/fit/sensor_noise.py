@@ -13,7 +13,7 @@ from magloc.readings import Readings
 
 _LOG = logging.getLogger(__name__)
 NOISY = 2.0
-"""Least ratio of measured to stated noise that counts."""
+"""Least ratio of measured to stated noise that is significant."""
 
 
 def white_noise_T(array: SensorArray) -> FloatArray:

@@ -109,7 +109,7 @@ class Mixture:
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_charted=N_SOURCE, n_pose=0)
 
     def drop_unlikely(self) -> Mixture:
-        """Return the mixture without components of negligible weight: more is asked of those that have run away.
+        """Return the mixture without components of negligible weight; at absurd ranges the limit is higher.
 
         A light component at an absurd range would be the mean of all.
         """

@@ -128,7 +128,7 @@ def effective_sample_size(drawn: Mixture) -> float:
 
 
 def sample_places(stack: Stack, places: Sequence[Places], prior: SourcePrior) -> Mixture | None:
-    """Sample places by all rows until enough of them count; None if none is possible."""
+    """Sample places by all rows until enough of them have weight; None if none is possible."""
     drawn: Mixture | None = None
     every = list(places)
     for _ in range(_MOST_ROUNDS if places else 0):

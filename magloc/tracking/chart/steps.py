@@ -40,9 +40,11 @@ from magloc.tracking.row_filter import Gaussians, steps_problem
 from magloc.tracking.sensor_health import OFFSETS, Misfits
 
 LARGEST_GROWTH = 1.5
-"""Largest growth of σ in a step for a prediction that is as nonlinear as the readings. With more growth its uncertainty
-is that of the motion, which is linear. Nor is a prediction as nonlinear as a row with missing readings, because the
-rows before had them."""
+"""Largest growth of σ in a step for a prediction that is as nonlinear as the readings.
+
+With more growth, the motion, which is linear, dominates its uncertainty. A row with missing readings is more nonlinear
+than its prediction, because earlier rows had these readings.
+"""
 LARGEST_WIDTH = 0.4
 """Largest standard deviation of log-range and direction of a component that counts as one place."""
 SETTLED = 0.05

@@ -1,6 +1,6 @@
 """One hypothesis of births, deaths and faults: its state, score, sources' ids, and how two are compared.
 
-What may have happened in a row is found in :mod:`.explanations`; the tracker extends and prunes hypotheses.
+:mod:`.explanations` finds the events that may have happened in a row; the tracker extends and prunes hypotheses.
 
 A Gaussian over which readings are nonlinear is split into three narrower ones, which later rows weigh. All rows of a
 young hypothesis are fitted together at growing intervals (:mod:`.smoothing`).

@@ -48,7 +48,7 @@ from magloc.tracking.rows import Row, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, Misfits, SensorHealth
 
 ROWS_TO_REPORT = 10
-"""Rows after its birth before a source is reported, unless it is the only one; a wrong division dies sooner."""
+"""Rows after its birth before a source is reported, unless it is the only one; a wrong division is dropped sooner."""
 # Largest number of searches for many sources in the first row, each with other random numbers.
 _SEARCHES = 4
 # Largest number of hypotheses, and largest difference of their scores.

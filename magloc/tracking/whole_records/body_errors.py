@@ -33,7 +33,7 @@ _NEGLIGIBLE = 1e-2
 def body_factor(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> float:
     """Return the ratio of the rms error of the last row, for a body, to its standard deviation.
 
-    It is NaN if the range is not known, and 1 of a magnet of known shape. The body does not turn. Its length is a
+    It is NaN if the range is not known, and 1 for a magnet of known shape. The body does not turn. Its length is a
     quarter of the least distance of the source from a sensor.
     """
     if magnet_of(tracker.array) is not None:

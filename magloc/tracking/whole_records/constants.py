@@ -27,7 +27,7 @@ from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import iterate_steps
 
 _LEAST_KNOWN = 1e-6
-"""Least variance of the estimate in a direction of the constants that counts."""
+"""Least variance of the estimate in a direction of the constants that is used."""
 _USUAL_AMBIENT_T = 300e-9
 """Usual error of an ambient field that counts as exact: crust and storms cause some 100 nT."""
 

@@ -7,7 +7,7 @@ from threading import Lock
 
 
 class CoalescedCall:
-    """Callable that merges calls during a run of its work into one more run after it.
+    """Callable that runs its work; calls during a run are merged into one more run after it.
 
     The work reads the present state, so that the last run uses the last state, however many calls came meanwhile. A
     call never waits for another one.

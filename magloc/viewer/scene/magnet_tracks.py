@@ -9,7 +9,7 @@ from magloc.tracking.results import TrackResult
 
 
 def magnet_tracks(body: MagnetBody, poses: BodyPoses) -> TrackResult:
-    """Return the tracks of a body's magnets, one a magnet in their order, in the rows that have a pose.
+    """Return the tracks of a body's magnets, one for each magnet in their order, in the rows that have a pose.
 
     Raises
     ------
