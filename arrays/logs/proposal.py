@@ -139,7 +139,9 @@ def propose_columns(path: str | PathLike[str]) -> Proposal:
     for key in ("valid", "fix"):
         if (flag := _find(header, key)) is not None:
             seen = ", ".join(f"{value:g}" for value in np.unique(values[flag][np.isfinite(values[flag])])[:6])
-            asked.append(f'which values of {flag} count (seen: {seen})? {key} = {{column = "{flag}", equals = [...]}}')
+            asked.append(
+                f'which values of {flag} are valid (seen: {seen})? {key} = {{column = "{flag}", equals = [...]}}'
+            )
     return Proposal(channels, keys, sensors, asked, number)
 
 

@@ -120,7 +120,7 @@ def _complete(
             if key in item:
                 raise InputError(
                     f"{place}, key {key}: found although the sensors are of the kind {settings.kind}, "
-                    "expected what differs from that kind in the table sensors."
+                    "expected only keys that differ from that kind in the table sensors."
                 )
         reads = SENSOR_KINDS[settings.kind].reads
         if item.get("kind", reads) != reads:
