@@ -87,24 +87,28 @@ class SatelliteEstimate:
 class SatelliteFilter:
     """Attitude and rate of a satellite by an error-state Kalman filter, one reading at a time.
 
-    The filter is the ``mekf`` of :func:`adcs.estimate`, with its gate. It starts at the first instant that determines
-    an attitude: with a star tracker at the first reading, without one when field and Sun are read. Field and Sun are
-    computed at each time. :func:`adcs.estimate` interpolates them, which changes them by less than 0.05 nT and 1e-7
-    rad; otherwise the numbers are the same.
+    It is the multiplicative extended Kalman filter (``mekf``) of :func:`adcs.estimate`, with its gate: a reading that
+    contradicts the prediction with a probability below one in a million is rejected. The filter starts at the first
+    instant that determines an attitude: with a star tracker at its first reading, otherwise at the first reading of
+    both field and Sun. Field and Sun are computed at each time. :func:`adcs.estimate` interpolates them, which changes
+    them by less than 0.05 nT and 1e-7 rad; otherwise the numbers are the same.
 
     Parameters
     ----------
     satellite : Satellite
         Inertia, orbit, sensors and their noise.
     sensors : str or EstimatorSettings
-        Sensors in use, such as ``"st+gyro"``, or all settings of a filter ``mekf``, which replace ``states`` too.
+        Sensors in use, of ``st`` (star tracker), ``gyro``, ``mag`` (magnetometer) and ``sun`` (Sun sensor), such as
+        ``"st+gyro"``; or all settings of a filter ``mekf``, which replace ``states`` too.
     states : iterable of str
-        States besides attitude and rate, as of :func:`adcs.estimate`.
+        States besides attitude and rate: ``gyro-bias`` [rad/s], ``field-bias`` (of the magnetometer) [T],
+        ``disturbance`` (angular acceleration) [1/s²], ``field-model`` (error of the field model) [T], ``dipole`` (of
+        the body) [A·m²], ``field-gain`` (gains and axes of the magnetometer).
     step_s : float
-        Usual time between updates, to which the process noise refers. Longer steps are divided into such ones.
+        Usual time between updates [s]. The process noise is stated for such a step, and longer steps are divided.
     horizon_s : float
-        Largest delay of a reading. The filter keeps its states for this time, and repeats the updates after a late
-        reading.
+        Largest delay of a late reading [s]; 0 refuses late readings. The filter keeps its states for this time, and
+        repeats the updates after a late reading.
 
     Raises
     ------

@@ -121,6 +121,11 @@ class PoseLimits:
         Box of the positions of the body's origin [m]; infinite without limits.
     angle_rad : float
         Largest rotation from the rest attitude, in which the axes of body and array agree [rad].
+
+    Raises
+    ------
+    ValueError
+        A lower limit is not below the upper one, or the angle is not above 0 and at most π.
     """
 
     low_m: Vector = (-math.inf, -math.inf, -math.inf)

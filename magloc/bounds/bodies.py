@@ -81,9 +81,21 @@ def body_bounds(array: SensorArray, body: MagnetBody, n: int = N_POSES) -> BodyB
     Parameters
     ----------
     array : SensorArray
+        Sensors with their noise and stated errors.
     body : MagnetBody
+        Magnets, their stated errors, and the limits of the pose.
     n : int
         Number of poses.
+
+    Returns
+    -------
+    BodyBounds
+        Poses in the array's frame, with the bound of each; infinite where the pose is not determined.
+
+    Raises
+    ------
+    ValueError
+        The array's noise, common field or ambient field is out of range.
     """
     check_magnitudes(array)
     used = with_offsets_as_noise(array)

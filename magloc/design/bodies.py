@@ -216,8 +216,10 @@ def design_body(
     task : BodyTask
         Volumes, least distances and criterion; :func:`magloc.design.body_task.read_body_task` reads one.
     array : SensorArray
+        Sensors about the body; the first start.
     body : MagnetBody
-        Its limits must have a box of positions. Moduli of the moments, shapes and errors remain.
+        Magnets of the first start. Its limits must have a box of positions. Moduli of the moments, shapes and errors
+        remain.
     rng : int or numpy.random.Generator
         Seed or generator of the starts; the given device is the first of them.
     progress : callable, optional
@@ -225,10 +227,15 @@ def design_body(
     better : callable, optional
         Called with array and body of every design that is better than all before on the large sample.
 
+    Returns
+    -------
+    BodyDesign
+        Array and body of the best design, with the bounds before and after.
+
     Raises
     ------
     ValueError
-        The limits have no box, or no start determines the pose.
+        The limits have no box, the array's numbers are out of range, or no start determines the pose.
     """
     check_magnitudes(array)
     if not body.limits.is_bounded:

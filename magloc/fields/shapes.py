@@ -201,6 +201,7 @@ def aligned_fields(
     points_m, position_m, moment_Am2 : array_like, shape (..., 3)
         Points, centre of the magnet and its moment in one frame [m], [A·m²].
     roll_rad : array_like, shape (...), optional
+        Roll of a cuboid about its moment [rad].
 
     Returns
     -------
@@ -208,6 +209,11 @@ def aligned_fields(
         Field [T]; NaN inside the magnet.
     jacobian : ndarray, shape (..., 3, 7)
         Its derivatives by (p, m) and by the roll [T/m], [T/(A·m²)], [T/rad].
+
+    Raises
+    ------
+    ValueError
+        An argument is not an array of 3-vectors, or the leading axes do not broadcast.
     """
     separation = _vectors("points_m", points_m) - _vectors("position_m", position_m)
     points, moments = np.broadcast_arrays(separation, _vectors("moment_Am2", moment_Am2))

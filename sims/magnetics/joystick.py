@@ -99,7 +99,24 @@ class Joystick:
     def read(
         self, position_m: FloatArray, rotation: Rotation, rng: np.random.Generator, *, start_s: float = 0.0
     ) -> Readings:
-        """Return noisy readings of the knob in poses, at 1 kHz."""
+        """Return noisy readings of the knob in poses, at 1 kHz.
+
+        Parameters
+        ----------
+        position_m : ndarray, shape (n, 3)
+            Position of the knob in the array's frame.
+        rotation : Rotation
+            Rotations (n,) from the knob's frame to the array's.
+        rng : numpy.random.Generator
+            Generator of the noise and of the ambient field's changes.
+        start_s : float
+            Time of the first row.
+
+        Returns
+        -------
+        Readings
+            Raw readings of the nine channels, with the device's errors.
+        """
         R, n = rotation.as_matrix(), len(position_m)
         places = position_m[:, None] + self.magnet_m @ np.swapaxes(R, -1, -2)
         moments = self.moment_Am2 @ np.swapaxes(R, -1, -2)
@@ -155,7 +172,24 @@ def random_poses(rng: np.random.Generator, n: int) -> tuple[FloatArray, Rotation
 
 
 def motion(rng: np.random.Generator, duration_s: float, slowest_s: float = 2.0) -> tuple[FloatArray, Rotation]:
-    """Return a smooth motion within the knob's range at 1 kHz: sums of a few sines of periods up to `slowest_s`."""
+    """Return a smooth motion within the knob's range at 1 kHz: sums of a few sines.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Generator of amplitudes and phases.
+    duration_s : float
+        Duration of the motion.
+    slowest_s : float
+        Longest period.
+
+    Returns
+    -------
+    position_m : ndarray, shape (n, 3)
+        Position of the knob in the array's frame.
+    rotation : Rotation
+        Rotations (n,) from the knob's frame to the array's.
+    """
     time_s = np.arange(round(duration_s * RATE_HZ)) / RATE_HZ
     frequency = np.arange(1, _HARMONICS + 1) / slowest_s
     phase = 2.0 * math.pi * (rng.uniform(size=(6, _HARMONICS)) + time_s[:, None, None] * frequency)
