@@ -98,7 +98,7 @@ def calibration_figure(result: SourceCalibration | BodyCalibration) -> Figure:
     groups = [(place, scale, label) for place, scale, label in _GROUPS if estimated[:, place].any()]
     figure = style.new_figure(1.5 + 1.35 * len(groups))
     axes = np.atleast_1d(figure.subplots(1 + len(groups), 1, sharex=True))
-    _draw_before_after(axes[0], *result.rms_T, "residual rms [nT]", "after calibration")
+    _draw_before_after(axes[0], *result.rms_T, "residual rms [nT]", "what is left of the readings")
     for ax, (place, scale, label) in zip(axes[1:], groups, strict=True):
         values = scale * np.where(estimated[:, place], result.change[:, place], np.nan)
         spread = scale * style.SIGMAS_95 * result.sigma[:, place]
