@@ -124,7 +124,8 @@ class BodyLocator:
         detected = is_detected(rows.energy, rows.n_differences)
         for i in np.flatnonzero(rows.is_silent | ~detected).tolist():
             poses.reason[i] = NO_SIGNAL if rows.is_silent[i] else "nothing stands out of the noise"
-            poses.chi2[i] = np.nan
+            for values in (poses.position_m, poses.R, poses.chi2, poses.covariance):
+                values[i] = np.nan
         if self.find_causes and dof > 0:
             self._name_causes(rows, poses, ambient_T)
         poses = _enlarged(poses)

@@ -37,7 +37,7 @@ def with_places(optima: RowOptima, width: int) -> RowOptima:
 
 def ranked(optima: RowOptima, length_m: float) -> RowOptima:
     """Return distinct optima within Δχ² 20 of the best, in order of χ²."""
-    if optima.chi2.shape[1] == 1:
+    if optima.chi2.shape[1] == 1 and np.isfinite(optima.chi2).all():
         return optima
     several: BoolArray = np.asarray(np.isfinite(optima.chi2[:, 1:]).any(axis=1))
     if several.all():

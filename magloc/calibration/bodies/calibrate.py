@@ -24,7 +24,7 @@ from magloc.bodies.locator import BodyLocator
 from magloc.bodies.poses import BodyPoses
 from magloc.calibration import least_squares as body_fit
 from magloc.calibration.array import CalibrationPrior
-from magloc.calibration.bodies.gauges import unobservable_of_body
+from magloc.calibration.bodies.gauges import unobservable_of_body, wider_limits
 from magloc.calibration.bodies.model import DIRECTION, PER_MAGNET, PLACE, STRENGTH, BodyProblem, BodyState, changed_body
 from magloc.calibration.bodies.results import BodyCalibration, PoseErrors
 from magloc.calibration.bodies.tolerances import with_posterior
@@ -364,6 +364,8 @@ def _result(
     array = apply_calibration(stated_array, state.sensors)
     body = changed_body(problem.body, state.magnets)
     array, body = with_posterior(problem, state, told, array, body)
+    unobservable = unobservable_of_body(problem, state, told)
+    body = replace(body, limits=wider_limits(problem, unobservable))
     return BodyCalibration(
         nominal=stated_array,
         array=array,
@@ -383,7 +385,7 @@ def _result(
         rms_T=(nominal.residual_rms_T(before.point.state), stated.residual_rms_T(state)),
         estimated=problem.free,
         covariance=covariance,
-        unobservable=unobservable_of_body(problem, state, told),
+        unobservable=unobservable,
         far_from_prior=_far_from_prior(problem, state),
         position_m=state.position_m,
         rotation=Rotation.from_matrix(state.R),
