@@ -11,6 +11,7 @@ from arrays.typing import FloatArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import body_fields
 from magloc.bodies.fit import linearise
+from magloc.bodies.lengths import check_lengths
 from magloc.bodies.locator import with_offsets_as_noise
 from magloc.bodies.optima import inverses
 from magloc.bodies.search import spread_poses
@@ -86,6 +87,7 @@ def body_bounds(array: SensorArray, body: MagnetBody, n: int = N_POSES) -> BodyB
         Number of poses.
     """
     check_magnitudes(array)
+    check_lengths(array, body)
     used = with_offsets_as_noise(array)
     position_m, R = spread_poses(body, used, n)
     return BodyBounds(position_m, R, pose_covariances(used, body, position_m, R), body_symmetry(body).words)

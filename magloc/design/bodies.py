@@ -24,6 +24,7 @@ from arrays.io.values import accept_seed, seed_of
 from arrays.typing import FloatArray, IntArray, Rng
 from magloc.bodies.body import Magnet, MagnetBody
 from magloc.bodies.field import placed_magnets
+from magloc.bodies.lengths import check_reach
 from magloc.bodies.locator import with_offsets_as_noise
 from magloc.bodies.search import spread_poses
 from magloc.bounds.bodies import N_POSES, BodyBounds, body_bounds, pose_covariances
@@ -232,6 +233,7 @@ def design_body(
     check_magnitudes(array)
     if not body.limits.is_bounded:
         raise ValueError("Input body must have limits of its position; instead received none in its table range.")
+    check_reach(array, body.as_dipoles())
     search = task.search
     used = with_offsets_as_noise(array)
     position_m, R = (values[N_POSES:] for values in spread_poses(body, used, N_POSES + 2**search.log2_large))

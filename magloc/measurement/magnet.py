@@ -21,6 +21,8 @@ from magloc.measurement.whitened import WhitenedModel
 
 UNKNOWN_ROLL_RAD = math.radians(90.0) / math.sqrt(12.0)
 """Standard deviation of a uniform roll of a cuboid with four-fold symmetry."""
+LARGEST_M = 0.5
+"""Length beyond that of all single magnets [m], unless the array is larger."""
 _LARGEST_ROLL_STEP_RAD = math.radians(15.0)
 
 
@@ -45,6 +47,11 @@ def array_near(array: SensorArray, magnet: Shape | None) -> SensorArray:
     if magnet is None:
         return array
     magnet.check_aligned()
+    if magnet.length_m > max(LARGEST_M, 2.0 * array.circumradius):
+        raise ValueError(
+            f"Input size_m must be that of a magnet in metres; instead received {[*magnet.size_m]}, larger than the"
+            f" array of {2.0 * array.circumradius:.3g} m. 10 mm are 0.01 m."
+        )
     return ArrayNearMagnet(**{one.name: getattr(array, one.name) for one in fields(SensorArray)}, magnet=magnet)
 
 

@@ -20,6 +20,7 @@ from arrays.noise import proportional_noise
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import body_fields
+from magloc.bodies.lengths import check_lengths
 from magloc.bodies.locator import BodyLocator
 from magloc.bodies.poses import BodyPoses
 from magloc.calibration import least_squares as body_fit
@@ -161,6 +162,7 @@ def calibrate_body(
         raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
     if array.n_sensors < 2:
         raise ValueError(f"Input array must have two sensors or more; instead received {array.n_sensors}.")
+    check_lengths(array, body)
     used, poses = _poses(array, body, rows, truth, free_rows)
     plain = _without_errors(array)
     problem = BodyProblem(
