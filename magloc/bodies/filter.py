@@ -19,6 +19,7 @@ from arrays.typing import FloatArray
 from magloc import core
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.locator import BodyLocator
+from magloc.bodies.plausibility import warn_of_no_check
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
 from magloc.bodies.search import fit_problem, packed, unpacked
 from magloc.bodies.track import BodyMotion, BodyTrack, TrackRows, joined_rows, judged, nearest_poses, placement_effects
@@ -402,7 +403,9 @@ def track_body(
     ambient = measured.ambient_T
     if ambient_T is not None:
         ambient = np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (len(measured), 3))
-    track = BodyTracker(array, body, motion).follow(measured.values_T, measured.time_s, ambient)
+    tracker = BodyTracker(array, body, motion)
+    warn_of_no_check(array, tracker.locator.n_unknowns)
+    track = tracker.follow(measured.values_T, measured.time_s, ambient)
     if progress is not None:
         progress(len(track))
     return track

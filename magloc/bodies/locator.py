@@ -17,8 +17,8 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import placed_magnets
 from magloc.bodies.fit import linearise, refine_poses
-from magloc.bodies.lengths import check_lengths, warn_of_inside
 from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_alternatives, with_places
+from magloc.bodies.plausibility import check_lengths, warn_of_inside, warn_of_no_check
 from magloc.bodies.poses import BodyPoses
 from magloc.bodies.search import (
     KEEP_WITHIN,
@@ -444,6 +444,7 @@ def locate_body(
     if ambient_T is not None:
         ambient = np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (len(measured), 3))
     locator = BodyLocator(array, body)
+    warn_of_no_check(array, locator.n_unknowns)
     poses = locator.fit_rows(measured.values_T, ambient, time_s=measured.time_s, progress=progress)
     warn_of_inside(array, body, poses)
     return poses

@@ -11,9 +11,9 @@ from arrays.typing import FloatArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import body_fields
 from magloc.bodies.fit import linearise
-from magloc.bodies.lengths import check_lengths
 from magloc.bodies.locator import with_offsets_as_noise
 from magloc.bodies.optima import inverses
+from magloc.bodies.plausibility import check_lengths
 from magloc.bodies.search import spread_poses
 from magloc.bodies.symmetry import body_symmetry
 from magloc.levels import TYPICAL_AND_BAD

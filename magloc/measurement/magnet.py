@@ -64,9 +64,12 @@ def check_without_roll(array: SensorArray) -> None:
     """Raise ValueError for a source whose roll is not a state of a track."""
     magnet = magnet_of(array)
     if magnet is not None and magnet.kind == "cuboid":
+        diameter_m = 2.0 * magnet.size_m[0] / math.sqrt(math.pi)
         raise ValueError(
-            "Input magnet must be a cylinder, a ring or a sphere in a track, which has no state of its roll;"
-            f" instead received a cuboid of size_m {[*magnet.size_m]}."
+            "Input magnet must be a cylinder, a ring or a sphere in a track, which has no state of its roll; instead"
+            f" received a cuboid of size_m {[*magnet.size_m]}. Locate it in every row, or track the cylinder of equal"
+            f" volume, of size_m [{diameter_m:.4g}, {magnet.size_m[2]:g}]: it is off by a hundredth of a length"
+            " at a gap of one length."
         )
 
 

@@ -20,8 +20,8 @@ from arrays.noise import proportional_noise
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import body_fields
-from magloc.bodies.lengths import check_lengths
 from magloc.bodies.locator import BodyLocator
+from magloc.bodies.plausibility import check_lengths
 from magloc.bodies.poses import BodyPoses
 from magloc.calibration import least_squares as body_fit
 from magloc.calibration.array import CalibrationPrior

@@ -12,8 +12,8 @@ import pytest
 from arrays.array import SensorArray
 from magloc.bodies.body import MagnetBody, PoseLimits
 from magloc.bodies.filter import BodyTracker
-from magloc.bodies.lengths import check_lengths, check_reach
 from magloc.bodies.locator import BodyLocator
+from magloc.bodies.plausibility import check_lengths, check_reach, warn_of_no_check
 from magloc.bounds.bodies import body_bounds
 from magloc.fields.shapes import Shape
 from tests.magloc.bodies.devices import hall_ring, knob
@@ -75,3 +75,11 @@ def test_a_body_that_holds_a_sensor_in_every_pose_is_refused() -> None:
 def test_true_lengths_are_accepted() -> None:
     for body in (knob(), replace(knob(), limits=PoseLimits()), balls(0.005)):
         check_lengths(hall_ring(), body)
+
+
+@pytest.mark.parametrize(("sensors", "common_T", "doubtful"), [(3, 50e-6, True), (3, 1e-6, False), (4, 50e-6, False)])
+def test_readings_that_leave_no_check_are_a_warning(
+    sensors: int, common_T: float, doubtful: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_no_check(hall_ring(sensors, common_field_T=common_T), 6)
+    assert ("9 readings leave no check of a pose" in caplog.text) is doubtful

@@ -1,4 +1,4 @@
-"""Lengths of a body and an array that contradict each other, as those in other units than metres do."""
+"""Plausibility of a body and an array: lengths in another unit than metres, and readings that leave no check."""
 
 from __future__ import annotations
 
@@ -72,6 +72,21 @@ def warn_of_inside(array: SensorArray, body: MagnetBody, poses: BodyPoses) -> No
         _LOG.warning(
             f"in {int(inside.any(axis=(1, 2)).sum())} of {len(poses)} rows a sensor lies inside a magnet:"
             f" {array.ids[s]} in {body.ids[k]}; check the positions of magnets and sensors"
+        )
+
+
+def warn_of_no_check(array: SensorArray, n_unknowns: int) -> None:
+    """Warn of an array whose readings are as many as the unknowns of a pose, so that χ² shows no error."""
+    common_T = array.common_field_T
+    noise_T = float(np.median(array.channel_noise_T))
+    known = 0.0 if common_T is None else 3.0 / (1.0 + array.n_sensors * (common_T / noise_T) ** 2)
+    left = array.n_channels - 3 - n_unknowns + known
+    if -0.5 < left < 0.5:
+        stated = "none is stated" if common_T is None else f"{1e9 * common_T:.3g} nT are stated"
+        _LOG.warning(
+            f"{array.n_channels} readings leave no check of a pose: six are its own, three those of the common field,"
+            f" and χ² shows neither iron nearby nor a larger noise; add a sensor, or state a common_field_nT near the"
+            f" noise of {1e9 * noise_T:.3g} nT ({stated})"
         )
 
 
