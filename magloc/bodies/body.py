@@ -14,6 +14,7 @@ from arrays.sensor import _finite, _not_negative
 from arrays.typing import FloatArray, Vector
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.fields.shapes import Shape
+from magloc.navigation.rotations import unit_across
 
 LARGEST_REMANENCE_T = 2.0
 """Remanence beyond that of all magnets [T]; the best of NdFeB have 1.5 T."""
@@ -105,10 +106,16 @@ class Magnet:
         if self.shape is None or self.shape.kind not in ("cylinder", "ring"):
             return np.eye(3)
         axis = np.array(self.moment_Am2) / self.modulus_Am2
-        other = np.eye(3)[np.argmin(np.abs(axis))]
-        x = np.cross(other, axis)
-        x /= np.linalg.norm(x)
+        x = unit_across(axis)
         return np.column_stack([x, np.cross(axis, x), axis])
+
+    def rotate(self, turn: FloatArray) -> Magnet:
+        """Return the magnet after a rotation (3, 3) in the body's frame about its centre."""
+        moment = tuple((turn @ np.array(self.moment_Am2)).tolist())
+        if self.shape is None or (self.rotation_xyzw is None and self.shape.kind != "cuboid"):
+            return replace(self, moment_Am2=moment)
+        rotation = Rotation.from_matrix(turn @ self.R_body_from_shape).as_quat()
+        return replace(self, moment_Am2=moment, rotation_xyzw=tuple(rotation.tolist()))
 
 
 @dataclass(frozen=True)

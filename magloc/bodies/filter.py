@@ -1,11 +1,13 @@
 """Track a body through time: pose, rates, and lasting errors of magnets and sensors, by ``pose_track.hpp``.
 
 Velocity and rotation rate are Ornstein-Uhlenbeck processes, driven by white acceleration. Errors of the magnets'
-moments and of the sensors are constants, or processes, that the whole track estimates.
+moments and of the sensors are constants, or processes, that the whole track estimates. So are errors of the magnets'
+positions and directions, whose effects are those at the pose of the row by itself.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -17,10 +19,10 @@ from arrays.typing import FloatArray
 from magloc import core
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.locator import BodyLocator
+from magloc.bodies.plausibility import warn_of_no_check
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
 from magloc.bodies.search import fit_problem, packed, unpacked
-from magloc.bodies.track import BodyMotion, BodyTrack
-from magloc.bodies.track_rows import TrackRows, joined_rows
+from magloc.bodies.track import BodyMotion, BodyTrack, TrackRows, joined_rows, judged, nearest_poses, placement_effects
 from magloc.chi_square import quantile
 from magloc.levels import CONTRADICTION
 from magloc.measurement.channels import signals_of
@@ -36,6 +38,7 @@ TRACKED, CONTRADICTS = "tracked", "this row contradicts the track"
 _POSE, _RATES = 6, 6
 _WIDENED = 1e4  # on the covariance of the fix that starts a track: its row is used again
 _LOOK_AHEAD = 20
+_STEADY = 0.025  # time over which a pose is nearly the same, in correlation times of the motion
 _ROWS_A_BLOCK = 500
 _MAX_ITERATIONS, _TOLERANCE = 12, 1e-6
 
@@ -55,7 +58,12 @@ class BodyTracker:
         self.locator = BodyLocator(array, body)
         self._errors = SensorErrors.of(array)
         self._white = without_lasting_errors(array) if self._errors.n_states else array
+        self._n_placement = sum(
+            3 * bool(magnet.position_sigma_m) + 2 * bool(magnet.direction_sigma_rad) for magnet in body.magnets
+        )
         self._last_s: float | None = None
+        self._recent = np.zeros((0, 2))
+        self._located_pose, self._located_step = (np.full(3, np.nan), np.eye(3)), math.nan
         self._state: _State | None = None
         self._lasting: tuple[FloatArray, FloatArray] | None = None  # of the errors: mean, covariance
 
@@ -74,7 +82,7 @@ class BodyTracker:
         values = check_rows(self.array, readings_T)
         n = len(values)
         track = replace(BodyTrack.none(n, 1, self.locator.symmetry.words), time_s=np.asarray(time_s, dtype=np.float64))
-        rows = self._rows(values, ambient_T)
+        rows = self._rows(values, ambient_T, track.time_s)
         problem = _TrackProblem(self, rows, track.time_s, self._last_s)
         row = 0
         while row < n:
@@ -92,6 +100,7 @@ class BodyTracker:
                 self._keep_errors()
                 self._state = None
         self._last_s = float(track.time_s[-1]) if n else self._last_s
+        self._recent = judged(track, self._recent)
         return track
 
     def _start(
@@ -116,12 +125,13 @@ class BodyTracker:
     def _state_of(self, model: WhitenedModel, position_m: FloatArray, R: FloatArray, covariance: FloatArray) -> _State:
         """Return the state of a fix, whose row is used again, with unknown rates."""
         q, a = self.body.moment_root.shape[1], self._errors.n_states
-        n_errors = q + a
+        n_errors = q + a + self._n_placement
         n = _POSE + n_errors + _RATES
         P = np.zeros((n, n))
         unit = np.repeat([1.0 / model.radius, 1.0], 3)
         P[:_POSE, :_POSE] = _WIDENED * unit[:, None] * np.nan_to_num(covariance, nan=0.0) * unit
-        errors, of_errors = np.zeros(n_errors), np.diag(np.concatenate([np.ones(q), self._errors.sigma**2]))
+        errors, of_errors = np.zeros(n_errors), np.eye(n_errors)
+        of_errors[q : q + a, q : q + a] = np.diag(self._errors.sigma**2)
         if self._lasting is not None:
             errors, of_errors = self._lasting
         P[_POSE : _POSE + n_errors, _POSE : _POSE + n_errors] = of_errors
@@ -137,14 +147,40 @@ class BodyTracker:
             errors = slice(_POSE, _POSE + self._state.errors.size)
             self._lasting = self._state.errors.copy(), self._state.covariance[errors, errors].copy()
 
-    def _rows(self, values: FloatArray, ambient_T: FloatArray | None) -> TrackRows:
+    def _rows(self, values: FloatArray, ambient_T: FloatArray | None, time_s: FloatArray) -> TrackRows:
         """Return whitened rows in their order."""
         groups = list(whitened_rows(self._white, values, ambient_T, max(len(values), 1)))
+        effects = [self._effects(group) for group in groups]
+        if self._n_placement and len(values):
+            poses = self._located(values, ambient_T, time_s)
+            effects = [
+                np.concatenate([one, placement_effects(self.body, group, *poses)], axis=1)
+                for one, group in zip(effects, groups, strict=True)
+            ]
         if len(groups) == 1:
             (group,) = groups
             n_differences = np.full(len(values), group.n_differences, dtype=np.intp)
-            return TrackRows(group.model, group.y, n_differences, self._effects(group))
-        return joined_rows(groups, len(values), [self._effects(group) for group in groups])
+            return TrackRows(group.model, group.y, n_differences, effects[0])
+        return joined_rows(groups, len(values), effects)
+
+    def _located(
+        self, values: FloatArray, ambient_T: FloatArray | None, time_s: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return poses (n, 3) and (n, 3, 3) near those of rows, from rows that are located without a track."""
+        step = np.floor(time_s / (_STEADY * self.motion.correlation_s))
+        is_new = np.concatenate([[step[0] != self._located_step], np.diff(step) != 0])
+        ambient = None if ambient_T is None else ambient_T[is_new]
+        places, turns = nearest_poses(self.locator.fit_rows(values[is_new], ambient), *self._located_pose)
+        self._located_pose, self._located_step = (places[-1], turns[-1]), float(step[-1])
+        of_row = np.cumsum(is_new)
+        return places[of_row], turns[of_row]
+
+    def error_step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return what is left of lasting errors after a step, and the standard deviations that it adds."""
+        left, added = self._errors.step(dt_s)
+        # Their effects are linear near the pose alone, so that farther away they are as unknown as at first.
+        kept = np.full(self._n_placement, math.exp(-dt_s / self.motion.correlation_s))
+        return np.concatenate([left, kept]), np.concatenate([added, np.sqrt(1.0 - kept**2)])
 
     def _effects(self, group: WhitenedRows) -> FloatArray:
         """Return the whitened readings (b, a, C) of one standard unit of every lasting error of the sensors."""
@@ -187,7 +223,7 @@ class _TrackProblem:
         self.dt_s = time_s - before
         of_steps = {dt: tracker.motion.step(dt, radius) for dt in set(self.dt_s.tolist())}
         self.steps = np.array([of_steps[dt] for dt in self.dt_s.tolist()]).reshape(n, 10)
-        kept_added = {dt: tracker._errors.step(dt) for dt in set(self.dt_s.tolist())}
+        kept_added = {dt: tracker.error_step(dt) for dt in set(self.dt_s.tolist())}
         self.lasting, self.added = (
             np.array([kept_added[dt][part] for dt in self.dt_s.tolist()]).reshape(n, -1) for part in (0, 1)
         )
@@ -345,7 +381,7 @@ def track_body(
     array : SensorArray
         Array with the positions, noise and calibration of its sensors; lasting errors of theirs are estimated too.
     body : MagnetBody
-        Body with its magnets; errors of their moments are estimated too.
+        Body with its magnets; stated errors of their moments, positions and directions are estimated too.
     readings : Readings or array_like, shape (n, C)
         Raw readings [T] in order of time, NaN where missing. Poses are in the array's frame.
     motion : BodyMotion, optional
@@ -367,7 +403,9 @@ def track_body(
     ambient = measured.ambient_T
     if ambient_T is not None:
         ambient = np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (len(measured), 3))
-    track = BodyTracker(array, body, motion).follow(measured.values_T, measured.time_s, ambient)
+    tracker = BodyTracker(array, body, motion)
+    warn_of_no_check(array, tracker.locator.n_unknowns)
+    track = tracker.follow(measured.values_T, measured.time_s, ambient)
     if progress is not None:
         progress(len(track))
     return track

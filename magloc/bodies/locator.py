@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,8 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import placed_magnets
 from magloc.bodies.fit import linearise, refine_poses
-from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_places
+from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_alternatives, with_places
+from magloc.bodies.plausibility import check_lengths, warn_of_inside, warn_of_no_check
 from magloc.bodies.poses import BodyPoses
 from magloc.bodies.search import (
     KEEP_WITHIN,
@@ -36,9 +37,9 @@ from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, check_magnitudes, check_rows, check_spans, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
 
-_LOG = logging.getLogger(__name__)
 _WIDE_RAD = 1.2  # largest rotation beyond which the search has more candidates
 _MORE_CANDIDATES, _MORE_STARTS = 16384, 64
+_FEW = 3  # differences beyond the unknowns, up to which wrong poses explain readings too
 _ROWS_AT_ONCE = 2048
 _LIMIT_SIGMAS = 3.0
 _OPEN_SIGMA_RAD = np.pi / np.sqrt(3.0)  # of an angle that may be anything
@@ -62,7 +63,8 @@ class BodyLocator:
     Raises
     ------
     ValueError
-        The array has one sensor without a prior of the common field, or its numbers are out of range.
+        The array has one sensor without a prior of the common field, or its numbers are out of range, or the lengths of
+        array and body contradict each other.
     """
 
     array: SensorArray
@@ -74,6 +76,8 @@ class BodyLocator:
         if self.array.common_field_T is None:
             check_spans(self.array)
         check_magnitudes(self.array)
+        if self.find_causes:
+            check_lengths(self.array, self.body)
         object.__setattr__(self, "array", with_offsets_as_noise(self.array))
         object.__setattr__(self, "symmetry", body_symmetry(self.body))
         object.__setattr__(self, "_dipoles", self.body.as_dipoles() if self.body.has_shapes else self.body)
@@ -124,7 +128,8 @@ class BodyLocator:
         detected = is_detected(rows.energy, rows.n_differences)
         for i in np.flatnonzero(rows.is_silent | ~detected).tolist():
             poses.reason[i] = NO_SIGNAL if rows.is_silent[i] else "nothing stands out of the noise"
-            poses.chi2[i] = np.nan
+            for values in (poses.position_m, poses.R, poses.chi2, poses.covariance):
+                values[i] = np.nan
         if self.find_causes and dof > 0:
             self._name_causes(rows, poses, ambient_T)
         poses = _enlarged(poses)
@@ -149,15 +154,16 @@ class BodyLocator:
 
     def _optima(self, rows: WhitenedRows, body: MagnetBody) -> RowOptima:
         """Return the distinct optima of rows, after a second search for those that no pose fits."""
-        wide = self.body.limits.angle_rad > _WIDE_RAD or not self.body.limits.is_bounded
-        optima = self._search(
-            rows, body, 2 * N_CANDIDATES if wide else N_CANDIDATES, 3 * N_STARTS if wide else N_STARTS
-        )
+        n_candidates, n_starts = (2 * N_CANDIDATES, 3 * N_STARTS) if self._is_wide else (N_CANDIDATES, N_STARTS)
+        more_starts = _MORE_STARTS
+        if self._has_twins(rows):
+            n_candidates, n_starts, more_starts = _MORE_CANDIDATES, 2 * _MORE_STARTS, 4 * _MORE_STARTS
+        optima = self._search(rows, body, n_candidates, n_starts)
         dof = max(rows.n_differences - self.n_unknowns, 1)
         doubtful = ~(optima.chi2[:, 0] < quantile(dof, 1.0 - CREDIBLE_FIT))
         if doubtful.any():
             some = rows.select(doubtful)
-            again = self._search(some, body, _MORE_CANDIDATES, _MORE_STARTS)
+            again = self._search(some, body, _MORE_CANDIDATES, more_starts)
             before = np.nan_to_num(optima.chi2[doubtful, 0], nan=np.inf)
             better = np.nan_to_num(again.chi2[:, 0], nan=np.inf) < before
             width = max(again.chi2.shape[1], optima.chi2.shape[1])
@@ -168,10 +174,13 @@ class BodyLocator:
     def _search(self, rows: WhitenedRows, body: MagnetBody, n_candidates: int, n_starts: int) -> RowOptima:
         """Return the distinct optima of rows within Δχ² 20 and within the body's limits, best first."""
         exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
+        has_twins = self._has_twins(rows)
         table = self._table(rows, body, n_candidates)
-        keep_within = KEEP_WITHIN if exact else np.inf
+        keep_within = KEEP_WITHIN if exact and not has_twins else np.inf
         found = search_poses(rows.model, rows.y, body, table, n_starts=n_starts, keep_within=keep_within)
         optima = RowOptima(found.position_m, found.R, found.chi2, found.covariance)
+        if has_twins:
+            optima = with_alternatives(rows, body, optima)
         if body is self._dipoles and not exact:
             optima = self._settled(rows, optima)
         if self.symmetry.order > 1:
@@ -180,6 +189,20 @@ class BodyLocator:
         if self.symmetry.axis is not None:
             optima = replace(optima, covariance=self._with_open_axis(rows, optima, body))
         return ranked(optima, self.body.radius_m)
+
+    @cached_property
+    def _is_wide(self) -> bool:
+        """True if the limits leave more room than the search of a narrow range covers."""
+        limits = self.body.limits
+        return self._turns_far or bool(np.subtract(limits.high_m, limits.low_m).max() > 2.0 * self.array.circumradius)
+
+    @property
+    def _turns_far(self) -> bool:
+        return not self.body.limits.is_bounded or self.body.limits.angle_rad > _WIDE_RAD
+
+    def _has_twins(self, rows: WhitenedRows) -> bool:
+        """Return whether several poses may explain rows equally well."""
+        return self._turns_far and rows.n_differences - self.n_unknowns <= _FEW
 
     @property
     def _has_errors(self) -> bool:
@@ -421,24 +444,7 @@ def locate_body(
     if ambient_T is not None:
         ambient = np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (len(measured), 3))
     locator = BodyLocator(array, body)
+    warn_of_no_check(array, locator.n_unknowns)
     poses = locator.fit_rows(measured.values_T, ambient, time_s=measured.time_s, progress=progress)
-    _warn_of_inside(array, body, poses)
+    warn_of_inside(array, body, poses)
     return poses
-
-
-def _warn_of_inside(array: SensorArray, body: MagnetBody, poses: BodyPoses) -> None:
-    """Warn of poses in which a sensor is as near to a magnet as no magnet can come."""
-    solved = poses.solved
-    if not solved.any():
-        return
-    magnets, _ = placed_magnets(body, poses.position_m[solved, 0], poses.R[solved, 0])
-    apart = np.linalg.norm(magnets[:, :, None] - array.positions, axis=-1)
-    # The strongest magnets have 1.1 MA/m: a sphere of that magnetisation is the smallest that has the moment.
-    smallest_m = np.cbrt(3.0 * np.linalg.norm(body.moments_Am2, axis=1) / (4.0 * np.pi * 1.2e6))
-    inside = apart < smallest_m[:, None]
-    if inside.any():
-        _, k, s = np.argwhere(inside)[0].tolist()
-        _LOG.warning(
-            f"in {int(inside.any(axis=(1, 2)).sum())} of {len(poses)} rows a sensor lies inside a magnet:"
-            f" {array.ids[s]} in {body.ids[k]}; check the positions of magnets and sensors"
-        )

@@ -1,13 +1,23 @@
-"""Optima of rows: their order, and their covariances in other coordinates."""
+"""Optima of rows: their order, their covariances in other coordinates, and other poses whose readings are nearly alike.
+
+Where readings are few, a pose has near twins: magnets change places, the body turns about its total moment, which alone
+counts far away, or it moves on along the direction that the readings determine least. These are starts of a second
+search.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.bodies.search import KEEP_WITHIN
+from magloc.bodies.body import MagnetBody
+from magloc.bodies.search import KEEP_WITHIN, N_KEPT, refine_dipoles
+from magloc.measurement.rows import WhitenedRows
+from magloc.navigation.rotations import rotation_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +47,7 @@ def with_places(optima: RowOptima, width: int) -> RowOptima:
 
 def ranked(optima: RowOptima, length_m: float) -> RowOptima:
     """Return distinct optima within Δχ² 20 of the best, in order of χ²."""
-    if optima.chi2.shape[1] == 1:
+    if optima.chi2.shape[1] == 1 and np.isfinite(optima.chi2).all():
         return optima
     several: BoolArray = np.asarray(np.isfinite(optima.chi2[:, 1:]).any(axis=1))
     if several.all():
@@ -101,3 +111,82 @@ def inverses(jacobian: FloatArray) -> FloatArray:
     inverse = np.full(system.shape, np.nan)
     inverse[valid] = np.linalg.inv(system[valid])
     return np.asarray(scale[:, :, None] * inverse * scale[:, None])
+
+
+_ROLLS_RAD = np.radians([60.0, 120.0, 180.0, 240.0, 300.0])
+_MOST_PERMUTED = 3  # magnets; of more only neighbours change places in turn
+_STEPS = (-0.5, -0.2, 0.2, 0.5)  # along the least determined direction, in radians or radii of the body
+_SAME = 1e-3
+
+
+def with_alternatives(rows: WhitenedRows, body: MagnetBody, optima: RowOptima) -> RowOptima:
+    """Return the distinct optima of rows, with those that the other poses lead to."""
+    n, width = optima.chi2.shape
+    row, place = np.nonzero(np.isfinite(optima.chi2))
+    position, R = alternative_poses(
+        body, optima.position_m[row, place], optima.R[row, place], optima.covariance[row, place]
+    )
+    m = R.shape[1]
+    fits, covariance = refine_dipoles(
+        rows.model, rows.y, body, position.reshape(-1, 3), R.reshape(-1, 3, 3), row=np.repeat(row, m)
+    )
+    found = (fits.position_m, fits.R, np.where(fits.converged, fits.chi2, np.nan), covariance)
+    together = []
+    for before, after in zip(vars(optima).values(), found, strict=True):
+        values = np.full((n, width * m, *before.shape[2:]), np.nan)
+        values.reshape(n, width, m, *before.shape[2:])[row, place] = after.reshape(len(row), m, *before.shape[2:])
+        together.append(np.concatenate([before, values], axis=1))
+    return _best(RowOptima(*together), body.radius_m)
+
+
+def alternative_poses(
+    body: MagnetBody, position_m: FloatArray, R: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return other poses (b, m, 3) and (b, m, 3, 3) of poses (b, 3) and (b, 3, 3) with covariances (b, 6, 6)."""
+    turns = _turns(body)
+    turned = R[:, None] @ turns
+    places = position_m[:, None] + (R[:, None] - turned) @ body.centre_m
+    unit = np.repeat([1.0 / body.radius_m, 1.0], 3)
+    softest = np.linalg.eigh(np.nan_to_num(unit[:, None] * covariance * unit))[1][..., -1] / unit
+    steps = np.array(_STEPS)[:, None] * softest[:, None]
+    stepped = R[:, None] @ rotation_matrix(steps[..., 3:])
+    along = position_m[:, None] + steps[..., :3]
+    return np.concatenate([places, along], axis=1), np.concatenate([turned, stepped], axis=1)
+
+
+def _turns(body: MagnetBody) -> FloatArray:
+    """Return rotations (m, 3, 3) about the centre of the magnets whose fields are like that of the body."""
+    total = body.moments_Am2.sum(axis=0)
+    length = np.linalg.norm(total)
+    axis = total / length if length > 0.0 else np.array([0.0, 0.0, 1.0])
+    arms = (body.positions_m - body.centre_m) / body.radius_m
+    vectors = np.concatenate([arms, body.moments_Am2 / np.linalg.norm(body.moments_Am2, axis=1).max()])
+    n = len(arms)
+    turns = list(rotation_matrix(_ROLLS_RAD[:, None] * axis))
+    if n <= _MOST_PERMUTED:
+        orders = list(permutations(range(n)))[1:]
+    else:
+        orders = [tuple(np.roll(np.arange(n), k).tolist()) for k in range(1, n)]
+    for order in orders:
+        index = np.array(order)
+        turn, _ = Rotation.align_vectors(vectors[np.concatenate([index, n + index])], vectors)
+        turns.append(turn.as_matrix())
+    return np.array(turns)
+
+
+def _best(optima: RowOptima, length_m: float) -> RowOptima:
+    """Return the optima with the least χ² that differ from the ones before."""
+    order = np.argsort(np.nan_to_num(optima.chi2, nan=np.inf), axis=1, kind="stable")
+    rows = np.arange(len(order))[:, None]
+    x, R, chi2 = optima.position_m[rows, order], optima.R[rows, order], optima.chi2[rows, order]
+    way = np.linalg.norm(np.diff(x, axis=1), axis=-1) / length_m
+    turn = np.linalg.norm(np.diff(R, axis=1), axis=(-2, -1))
+    again = np.zeros(chi2.shape, dtype=np.bool_)
+    again[:, 1:] = (way + turn < _SAME) & (np.diff(chi2, axis=1) < _SAME * (1.0 + chi2[:, 1:]))
+    last = again | ~np.isfinite(chi2)
+    order = np.take_along_axis(order, np.argsort(last, axis=1, kind="stable"), axis=1)[:, :N_KEPT]
+    empty = np.take_along_axis(last, np.argsort(last, axis=1, kind="stable"), axis=1)[:, :N_KEPT]
+    best = RowOptima(*(values[rows, order] for values in vars(optima).values()))
+    for values in vars(best).values():
+        values[empty] = np.nan
+    return best

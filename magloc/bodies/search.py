@@ -171,16 +171,22 @@ def refine_dipoles(
     position_m: FloatArray,
     R: FloatArray,
     *,
+    row: IntArray | None = None,
     max_iterations: int = MAX_ITERATIONS,
 ) -> tuple[PoseFits, FloatArray]:
-    """Return :func:`magloc.bodies.fit.refine_poses` of a body of dipoles, compiled, and its covariances (b, 6, 6)."""
-    n = len(y)
+    """Return :func:`magloc.bodies.fit.refine_poses` of a body of dipoles, compiled, and its covariances (b, 6, 6).
+
+    `row` has the row of the model for each start; by default there is one start a row.
+    """
+    n = len(position_m)
     pose, chi2, covariance = np.empty((n, 12)), np.empty(n), np.empty((n, 6, 6))
     iterations, converged = np.empty(n, np.int64), np.empty(n, np.uint8)
     start = packed(model, position_m, R)
     results: dict[str, object] = {"start": start, "pose": pose, "chi2": chi2, "covariance": covariance}
     results |= {"iterations": iterations, "converged": converged}
-    work = fit_problem(model, signals_of(model, y), body, np.arange(n), max_iterations, **results)
+    work = fit_problem(
+        model, signals_of(model, y), body, np.arange(n) if row is None else row, max_iterations, **results
+    )
     core.run("refine_poses", work, n, block=_ROWS_A_BLOCK)
     position, rotation = unpacked(model, pose)
     fits = PoseFits(position, rotation, np.where(converged, chi2, np.inf), iterations.astype(np.intp))

@@ -12,6 +12,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.bodies.body import MagnetBody
+from magloc.navigation.rotations import unit_across
 
 _SAME = 1e-6  # largest relative difference of magnets that map onto each other
 _COLLINEAR = 1e-6
@@ -77,7 +78,7 @@ def body_symmetry(body: MagnetBody) -> BodySymmetry:
     second = int(np.argmax(across))
     if across[second] < _COLLINEAR:
         axis = vectors[first] / np.linalg.norm(vectors[first])
-        flip = 2.0 * np.outer(_across(axis), _across(axis)) - np.eye(3)
+        flip = 2.0 * np.outer(unit_across(axis), unit_across(axis)) - np.eye(3)
         turns = [np.eye(3), *([flip] if _maps(body, flip, arms, moments) else [])]
         return BodySymmetry(centre, np.array(turns), axis)
     frame = _frame(vectors[first], vectors[second])
@@ -92,12 +93,6 @@ def body_symmetry(body: MagnetBody) -> BodySymmetry:
         if not known and _maps(body, turn, arms, moments):
             found.append(turn)
     return BodySymmetry(centre, np.array(found))
-
-
-def _across(axis: FloatArray) -> FloatArray:
-    """Return a unit vector at right angles to an axis."""
-    other = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    return np.asarray(other / np.linalg.norm(other))
 
 
 def _frame(a: FloatArray, b: FloatArray) -> FloatArray:

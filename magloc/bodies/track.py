@@ -1,15 +1,21 @@
-"""Track of a body as a result, and the motion that a tracker assumes."""
+"""Track of a body as a result, the motion that a tracker assumes, and the rows that it follows."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from arrays.io.csv import Column
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
+from magloc.bodies.body import MagnetBody
+from magloc.bodies.fit import linearise
 from magloc.bodies.poses import BodyPoses
+from magloc.chi_square import quantile
+from magloc.levels import MISFIT
+from magloc.measurement.rows import WhitenedRows
+from magloc.measurement.whitened import WhitenedModel
 from magloc.state_space import ornstein_uhlenbeck_step
 
 _LARGEST_TURN_RAD = 0.5  # of a prediction; beyond it one Gaussian does not describe the pose
@@ -87,3 +93,76 @@ class BodyTrack(BodyPoses):
         """Return the results that ``magloc track --body --json`` prints."""
         for i, entry in enumerate(super().entries()):
             yield entry | {"status": self.status[i]}
+
+
+_RECENT = 50  # rows of a track over which its NIS is judged
+
+
+@dataclass(frozen=True, eq=False)
+class TrackRows:
+    """Whitened rows of any missing channels, for the kernel."""
+
+    model: WhitenedModel
+    y: FloatArray
+    n_differences: IntArray
+    effects: FloatArray  # (n, a, C)
+
+
+def joined_rows(groups: list[WhitenedRows], n: int, effects: list[FloatArray]) -> TrackRows:
+    """Return rows of several groups in their order; common fields of fewer columns are filled up with zeros."""
+    width = max(group.model.basis.shape[2] for group in groups)
+    first = groups[0].model
+    n_channels, n_errors = groups[0].y.shape[1], effects[0].shape[1]
+    gain, y = np.zeros((n, n_channels, 3)), np.zeros((n, n_channels))
+    basis, shrinkage = np.zeros((n, n_channels, width)), np.zeros((n, width))
+    ambient, n_differences = np.zeros((n, *first.ambient.shape[1:])), np.zeros(n, dtype=np.intp)
+    of_errors = np.zeros((n, n_errors, n_channels))
+    for group, effect in zip(groups, effects, strict=True):
+        at, q = group.index, group.model.basis.shape[2]
+        gain[at], y[at], ambient[at] = group.model.gain, group.y, group.model.ambient
+        basis[at, :, :q], shrinkage[at, :q] = group.model.basis, group.model.shrinkage
+        n_differences[at], of_errors[at] = group.n_differences, effect
+    model = replace(first, gain=gain, ambient=ambient, basis=basis, shrinkage=shrinkage)
+    return TrackRows(model, y, n_differences, of_errors)
+
+
+def nearest_poses(poses: BodyPoses, position_m: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a pose for each row after a pose: of several the nearest to the one before, of none that one.
+
+    The results (n + 1, 3) and (n + 1, 3, 3) begin with the given pose.
+    """
+    places, turns = [position_m], [R]
+    for i, n_poses in enumerate(poses.n_poses.tolist()):
+        apart = np.linalg.norm(poses.R[i, : max(n_poses, 1)] - turns[-1], axis=(-2, -1))
+        k = int(np.argmin(apart))
+        places.append(poses.position_m[i, k] if n_poses else places[-1])
+        turns.append(poses.R[i, k] if n_poses else turns[-1])
+    return np.array(places), np.array(turns)
+
+
+def placement_effects(body: MagnetBody, group: WhitenedRows, position_m: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the whitened readings (b, e, C) of stated errors of positions and directions, at poses of all rows.
+
+    They are zero without a pose.
+    """
+    *_, errors = linearise(group.model, body, position_m[group.index], R[group.index])
+    of_places = group.model.whiten(np.nan_to_num(errors[..., body.moment_root.shape[1] :]))
+    return np.ascontiguousarray(of_places.transpose(0, 2, 1))
+
+
+def judged(track: BodyTrack, recent: FloatArray) -> FloatArray:
+    """Flag the rows of a track whose NIS, with that of rows before, is far beyond noise; return the last ones.
+
+    `recent` (m, 2) has NIS and degrees of freedom of the rows before. The covariance of these rows is enlarged.
+    """
+    used = np.flatnonzero(track.solved & (track.dof > 0))
+    all_rows = np.concatenate([recent, np.column_stack([track.nis[used], track.dof[used]])])
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(all_rows, axis=0)])
+    end = len(recent) + 1 + np.arange(used.size)
+    nis, dof = (sums[end] - sums[np.maximum(end - _RECENT, 0)]).T
+    limits = {d: quantile(int(d), MISFIT) for d in np.unique(dof).tolist()}
+    over = nis > np.array([limits[d] for d in dof.tolist()])
+    for i, factor in zip(used[over].tolist(), (nis[over] / dof[over]).tolist(), strict=True):
+        track.flags[i] = (*track.flags[i], "misfit")
+        track.covariance[i] *= factor
+    return all_rows[-_RECENT:]

@@ -13,6 +13,7 @@ from magloc.bodies.field import body_fields
 from magloc.bodies.fit import linearise
 from magloc.bodies.locator import with_offsets_as_noise
 from magloc.bodies.optima import inverses
+from magloc.bodies.plausibility import check_lengths
 from magloc.bodies.search import spread_poses
 from magloc.bodies.symmetry import body_symmetry
 from magloc.levels import TYPICAL_AND_BAD
@@ -98,6 +99,7 @@ def body_bounds(array: SensorArray, body: MagnetBody, n: int = N_POSES) -> BodyB
         The array's noise, common field or ambient field is out of range.
     """
     check_magnitudes(array)
+    check_lengths(array, body)
     used = with_offsets_as_noise(array)
     position_m, R = spread_poses(body, used, n)
     return BodyBounds(position_m, R, pose_covariances(used, body, position_m, R), body_symmetry(body).words)

@@ -26,6 +26,7 @@ from arrays.typing import FloatArray, IntArray, Rng
 from magloc.bodies.body import Magnet, MagnetBody
 from magloc.bodies.field import placed_magnets
 from magloc.bodies.locator import with_offsets_as_noise
+from magloc.bodies.plausibility import check_reach
 from magloc.bodies.search import spread_poses
 from magloc.bounds.bodies import N_POSES, BodyBounds, body_bounds, pose_covariances
 from magloc.design.body_task import BodyTask
@@ -152,15 +153,8 @@ class BodyProblem:
 
 def turned_magnet(magnet: Magnet, direction: FloatArray) -> Magnet:
     """Return a magnet that is rotated so that its moment has a direction; its shape turns with the moment."""
-    before = np.array(magnet.moment_Am2) / magnet.modulus_Am2
-    after = direction / np.linalg.norm(direction)
-    moment = tuple((magnet.modulus_Am2 * after).tolist())
-    follows = magnet.shape is None or (magnet.shape.kind in ("cylinder", "ring", "sphere") and not magnet.rotation_xyzw)
-    if follows:
-        return replace(magnet, moment_Am2=moment)
-    turn, _ = Rotation.align_vectors([after], [before])
-    rotation = (turn * Rotation.from_matrix(magnet.R_body_from_shape)).as_quat()
-    return replace(magnet, moment_Am2=moment, rotation_xyzw=tuple(rotation.tolist()))
+    turn, _ = Rotation.align_vectors([direction], [magnet.moment_Am2])
+    return magnet.rotate(turn.as_matrix())
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +234,7 @@ def design_body(
     check_magnitudes(array)
     if not body.limits.is_bounded:
         raise ValueError("Input body must have limits of its position; instead received none in its table range.")
+    check_reach(array, body.as_dipoles())
     search = task.search
     used = with_offsets_as_noise(array)
     position_m, R = (values[N_POSES:] for values in spread_poses(body, used, N_POSES + 2**search.log2_large))

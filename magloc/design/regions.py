@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import betainc
 
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import unit_across
 
 
 class Region(Protocol):
@@ -125,8 +126,7 @@ def around(axis: FloatArray, along: FloatArray, turn: FloatArray) -> FloatArray:
     They are turned around it by shares (n, 1) of a revolution.
     """
     n = axis / np.linalg.norm(axis)
-    first = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
-    first /= np.linalg.norm(first)
+    first = unit_across(n)
     across = np.sqrt(np.maximum(0.0, 1.0 - along * along))
     angle = 2.0 * np.pi * turn
     return along * n + across * (np.cos(angle) * first + np.sin(angle) * np.cross(n, first))

@@ -21,6 +21,8 @@ from magloc.measurement.whitened import WhitenedModel
 
 UNKNOWN_ROLL_RAD = math.radians(90.0) / math.sqrt(12.0)
 """Standard deviation of a uniform roll of a cuboid with four-fold symmetry."""
+LARGEST_M = 0.5
+"""Length beyond that of all single magnets [m], unless the array is larger."""
 _LARGEST_ROLL_STEP_RAD = math.radians(15.0)
 
 
@@ -45,6 +47,11 @@ def array_near(array: SensorArray, magnet: Shape | None) -> SensorArray:
     if magnet is None:
         return array
     magnet.check_aligned()
+    if magnet.length_m > max(LARGEST_M, 2.0 * array.circumradius):
+        raise ValueError(
+            f"Input size_m must be that of a magnet in metres; instead received {[*magnet.size_m]}, larger than the"
+            f" array of {2.0 * array.circumradius:.3g} m. 10 mm are 0.01 m."
+        )
     return ArrayNearMagnet(**{one.name: getattr(array, one.name) for one in fields(SensorArray)}, magnet=magnet)
 
 
@@ -57,9 +64,12 @@ def check_without_roll(array: SensorArray) -> None:
     """Raise ValueError for a source whose roll is not a state of a track."""
     magnet = magnet_of(array)
     if magnet is not None and magnet.kind == "cuboid":
+        diameter_m = 2.0 * magnet.size_m[0] / math.sqrt(math.pi)
         raise ValueError(
-            "Input magnet must be a cylinder, a ring or a sphere in a track, which has no state of its roll;"
-            f" instead received a cuboid of size_m {[*magnet.size_m]}."
+            "Input magnet must be a cylinder, a ring or a sphere in a track, which has no state of its roll; instead"
+            f" received a cuboid of size_m {[*magnet.size_m]}. Locate it in every row, or track the cylinder of equal"
+            f" volume, of size_m [{diameter_m:.4g}, {magnet.size_m[2]:g}]: it is off by a hundredth of a length"
+            " at a gap of one length."
         )
 
 

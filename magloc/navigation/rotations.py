@@ -19,6 +19,13 @@ def cross_matrix(vector: ArrayLike) -> FloatArray:
     return K
 
 
+def unit_across(direction: FloatArray) -> FloatArray:
+    """Return unit vectors at right angles to directions (..., 3), which need not have the length 1."""
+    # The axis of the smallest component is not along the direction.
+    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
+    return np.asarray(first / np.linalg.norm(first, axis=-1, keepdims=True))
+
+
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
     """Return rotation matrices (..., 3, 3) of vectors (..., 3) [rad], by Rodrigues' formula."""
     angle = np.sqrt(np.sum(rotation_vector * rotation_vector, axis=-1))[..., None, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -10,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import magloc
 from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
+from magloc.bodies.field import placed_magnets
 from magloc.live.follower import Follower
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings, write_readings
@@ -21,6 +24,7 @@ from magloc.tracking.motion import RandomWalk
 from magloc.viewer.live_view import LiveView
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, TRACK_COLOUR
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
+from tests.magloc.bodies.devices import hall_ring, knob, readings_of
 
 ARRAY = tetrahedron(1.5, noise_T=1e-11)
 N = 200
@@ -151,4 +155,37 @@ def test_a_loop_of_ones_own(screen: Screen) -> None:
             view.update(tracker.update(row), row)
         screen.until(lambda: "time 0.380 s" in screen.text(), "the newest row")
         assert "Stop" not in screen.text()
+        screen.leave()
+
+
+def test_a_body_turns_when_a_row_arrives(screen: Screen) -> None:
+    """A knob turns by 60° about its axis: its magnets leave their places, and the words have units."""
+    array, body = hall_ring(4, common_field_T=None), knob(angle_rad=np.radians(65.0))
+    angle = np.radians(60.0) * np.linspace(0.0, 1.0, 120)
+    R = Rotation.from_rotvec(angle[:, None] * np.array([0.0, 0.0, 1.0])).as_matrix()
+    position_m = np.tile([0.0, 0.0, 0.015], (120, 1))
+    rows = Readings(readings_of(array, body, position_m, R, np.random.default_rng(0)), time_s=np.arange(120) / 100.0)
+    (before, after), _ = placed_magnets(body, position_m[[0, -1]], R[[0, -1]])
+    follower = Follower(array, body=body)
+    with LiveView(array, controls=follower, port=0, open=False) as view:
+        screen.open_server(view._server)
+        points = list(follower.follow(rows))
+        camera = screen.live_camera(view._server)
+        view.update(points[0])
+        screen.until(lambda: "time 0.000 s" in screen.text(), "the first row")
+        screen.until_seen(Sight("magnets", camera.pixels(before), ORANGE))
+        for point in points[1:]:
+            view.update(point)
+        screen.until(lambda: "time 1.190 s" in screen.text(), "the newest row")
+        screen.until_seen(
+            Sight("magnets", camera.pixels(after), ORANGE),
+            Sight("magnets where they were", camera.pixels(before), ORANGE, absent=True),
+        )
+        words = screen.text()
+        assert re.search(r"tracked at \([-0-9., ]+\) m", words)
+        assert re.search(r"σ x [0-9.]+ [µm]?m, y [0-9.]+ [µm]?m, z [0-9.]+ [µm]?m", words)
+        turn = re.search(r"rotation vector \(([-0-9., ]+)\)°", words)
+        assert turn is not None
+        np.testing.assert_allclose([float(x) for x in turn.group(1).split(",")], [0.0, 0.0, 60.0], atol=0.5)
+        assert re.search(r"σ of the rotation \([-0-9., e]+\)°", words)
         screen.leave()

@@ -21,10 +21,11 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import body_fields
 from magloc.bodies.locator import BodyLocator
+from magloc.bodies.plausibility import check_lengths
 from magloc.bodies.poses import BodyPoses
 from magloc.calibration import least_squares as body_fit
 from magloc.calibration.array import CalibrationPrior
-from magloc.calibration.bodies.gauges import unobservable_of_body
+from magloc.calibration.bodies.gauges import unobservable_of_body, wider_limits
 from magloc.calibration.bodies.model import DIRECTION, PER_MAGNET, PLACE, STRENGTH, BodyProblem, BodyState, changed_body
 from magloc.calibration.bodies.results import BodyCalibration, PoseErrors
 from magloc.calibration.bodies.tolerances import with_posterior
@@ -161,6 +162,7 @@ def calibrate_body(
         raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
     if array.n_sensors < 2:
         raise ValueError(f"Input array must have two sensors or more; instead received {array.n_sensors}.")
+    check_lengths(array, body)
     used, poses = _poses(array, body, rows, truth, free_rows)
     plain = _without_errors(array)
     problem = BodyProblem(
@@ -364,6 +366,8 @@ def _result(
     array = apply_calibration(stated_array, state.sensors)
     body = changed_body(problem.body, state.magnets)
     array, body = with_posterior(problem, state, told, array, body)
+    unobservable = unobservable_of_body(problem, state, told)
+    body = replace(body, limits=wider_limits(problem, unobservable))
     return BodyCalibration(
         nominal=stated_array,
         array=array,
@@ -383,7 +387,7 @@ def _result(
         rms_T=(nominal.residual_rms_T(before.point.state), stated.residual_rms_T(state)),
         estimated=problem.free,
         covariance=covariance,
-        unobservable=unobservable_of_body(problem, state, told),
+        unobservable=unobservable,
         far_from_prior=_far_from_prior(problem, state),
         position_m=state.position_m,
         rotation=Rotation.from_matrix(state.R),

@@ -7,9 +7,12 @@ translation of sensors and magnets, and a single known pose leaves their common 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.bodies.body import PoseLimits
 from magloc.calibration.bodies.model import (
     DIRECTION,
     PER_MAGNET,
@@ -22,6 +25,8 @@ from magloc.calibration.bodies.model import (
 from magloc.calibration.observability import Unobservable, gauge_vectors, unknown_name, unobservable_directions
 from magloc.calibration.sensors import POSITION
 from magloc.navigation.rotations import turn_of_change
+
+_FRAME_SIGMAS = 3.0
 
 
 def body_gauges(problem: BodyProblem, state: BodyState) -> dict[str, FloatArray]:
@@ -75,6 +80,32 @@ def unobservable_of_body(problem: BodyProblem, state: BodyState, information: Fl
         return unknown_name(problem.array, index) if index < problem.free.size else _name_of_magnet(problem, index)
 
     return unobservable_directions(information, body_gauges(problem, state), free, name_of)
+
+
+def wider_limits(problem: BodyProblem, unobservable: tuple[Unobservable, ...]) -> PoseLimits:
+    """Return the body's limits in the frames of a calibration.
+
+    Unknown poses leave open where array and body stand in their frames. In these frames the same motion reaches
+    farther: by three standard deviations of the prior of their translations, rotations and size.
+    """
+    limits = problem.body.limits
+    if problem.has_pose.any():
+        return limits
+    middle = np.mean([limits.low_m, limits.high_m], axis=0) if limits.is_bounded else problem.array.centroid
+    of_array, of_body = (float(np.linalg.norm(x)) for x in (middle - problem.array.centroid, problem.body.centre_m))
+    squares_m, squares_rad = [0.0], [0.0]
+    for part in unobservable:
+        if "translation along" in part.name:
+            squares_m.append(part.prior**2)
+        elif "rotation about" in part.name:
+            squares_rad.append(part.prior**2)
+            squares_m.append((part.prior * (of_body if part.name.startswith("body") else of_array)) ** 2)
+        elif part.name.startswith("size"):
+            squares_m.append((part.prior * of_array) ** 2)
+    # Each axis has one of three translations and rotations.
+    margin_m, margin_rad = (_FRAME_SIGMAS * math.sqrt(sum(squares) / 3.0) for squares in (squares_m, squares_rad))
+    low, high = np.subtract(limits.low_m, margin_m), np.add(limits.high_m, margin_m)
+    return PoseLimits(tuple(low.tolist()), tuple(high.tolist()), min(limits.angle_rad + margin_rad, math.pi))
 
 
 def _name_of_magnet(problem: BodyProblem, index: int) -> str:

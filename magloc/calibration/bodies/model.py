@@ -28,7 +28,7 @@ from magloc.calibration.sensors import (
     sensor_derivatives,
     whitened_responses,
 )
-from magloc.navigation.rotations import rotation_matrix, turn_of_change
+from magloc.navigation.rotations import rotation_matrix, turn_of_change, unit_across
 
 PER_MAGNET = 6
 PLACE, STRENGTH, DIRECTION = slice(0, 3), slice(3, 4), slice(4, 6)
@@ -184,8 +184,7 @@ class BodyProblem(SensorProblem[BodyState]):
 def across(body: MagnetBody) -> FloatArray:
     """Return two unit vectors (K, 2, 3) across the moment of every magnet, in the body's frame."""
     along = body.moments_Am2 / np.linalg.norm(body.moments_Am2, axis=1, keepdims=True)
-    first = np.cross(along, np.eye(3)[np.argmin(np.abs(along), axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first = unit_across(along)
     return np.stack([first, np.cross(along, first)], axis=1)
 
 
@@ -194,14 +193,10 @@ def changed_body(body: MagnetBody, magnets: FloatArray) -> MagnetBody:
     turns = rotation_matrix(np.einsum("kda,kd->ka", across(body), magnets[:, DIRECTION]))
     changed = []
     for magnet, turn, change in zip(body.magnets, turns, magnets, strict=True):
-        moment = (1.0 + change[STRENGTH]) * (turn @ magnet.moment_Am2)
-        rotation = magnet.rotation_xyzw
-        if magnet.shape is not None and (rotation is not None or magnet.shape.kind == "cuboid"):
-            own = Rotation.identity() if rotation is None else Rotation.from_quat(rotation)
-            rotation = tuple((Rotation.from_matrix(turn) * own).as_quat().tolist())
+        rotated = magnet.rotate(turn)
         position = tuple((np.asarray(magnet.position_m) + change[PLACE]).tolist())
-        moment = tuple(moment.tolist())
-        changed.append(replace(magnet, position_m=position, moment_Am2=moment, rotation_xyzw=rotation))
+        moment = tuple(((1.0 + change[STRENGTH]) * np.array(rotated.moment_Am2)).tolist())
+        changed.append(replace(rotated, position_m=position, moment_Am2=moment))
     return replace(body, magnets=tuple(changed))
 
 

@@ -115,7 +115,8 @@ def calibrate_body(
         write_body(options.out_body, result.body)
     print_result(_report(result, len(rows), files.out, options.out_body), _lines(result), as_json=as_json)
     write_files(files.figures, calibration_files(result), "--figures")
-    for line in [] if as_json else _notes(result, len(rows)):
+    notes = [*_notes(result, len(rows)), *_notes_on_files(files.out, options.out_body)]
+    for line in [] if as_json else notes:
         note(line)
 
 
@@ -188,6 +189,17 @@ def _notes(result: BodyCalibration, n_rows: int) -> list[str]:
             f"{_CHECK}"
         )
     return notes
+
+
+def _notes_on_files(out: Path | None, out_body: Path | None) -> list[str]:
+    """Return a note on the calibrated files that no option writes."""
+    missing = [name for name, path in (("--out-array", out), ("--out-body", out_body)) if path is None]
+    if not missing:
+        return []
+    if len(missing) == 2:
+        return ["note: no file is written; --out-array FILE and --out-body FILE write the calibrated array and body"]
+    what = missing[0].removeprefix("--out-")
+    return [f"warning: the calibrated {what} is not written; array and body belong together: add {missing[0]} FILE"]
 
 
 def _validation_note(errors: PoseErrors) -> str:

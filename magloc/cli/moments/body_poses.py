@@ -159,6 +159,9 @@ def _note(poses: BodyPoses, readings: Path, *, as_json: bool) -> None:
         note(f"{n} of {len(poses)} rows with a pose" + (f"; not solved: {reasons}" if reasons else ""))
     if poses.symmetry:
         note(f"note: {poses.symmetry}")
+    several = int((poses.n_poses > 1).sum())
+    if several:
+        note(f"warning: {several} of {len(poses)} rows fit several poses; --json lists all, and one of them is true")
     words = {flag for flags in poses.flags for flag in flags}
     for word in sorted(words):
         rows = sum(word in flags for flags in poses.flags)

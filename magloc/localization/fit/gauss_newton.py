@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
+from magloc.navigation.rotations import unit_across
 
 # Predicted decrease of χ², absolute and relative, below which a fit has converged.
 PROMISE_ABSOLUTE = 1e-8
@@ -115,10 +116,7 @@ def tangents(q: FloatArray) -> FloatArray:
     u, s = q[..., :3], q[..., 3:]
     length = np.linalg.norm(u, axis=-1, keepdims=True)
     direction = np.where(length > 1e-12, u / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
-    # The axis of the smallest component of u is not along u.
-    axis = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
-    first = np.cross(direction, axis)
-    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    first = unit_across(direction)
     second = np.cross(direction, first)
     zero = np.zeros_like(s)
     columns = (

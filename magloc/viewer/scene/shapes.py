@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 
 from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import unit_across
 
 IntArray = NDArray[np.int64]
 CHI2_95 = {2: 5.991464547107979, 3: 7.814727903251179}
@@ -313,6 +314,5 @@ def _axes_along(vector: FloatArray) -> FloatArray:
     """Return right-handed unit axes as rows (3, 3), the last along a vector."""
     with np.errstate(invalid="ignore", divide="ignore"):
         along = vector / np.linalg.norm(vector)
-    across = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-    across /= np.linalg.norm(across)
+    across = unit_across(along)
     return np.stack([across, np.cross(along, across), along])

@@ -143,3 +143,61 @@ def test_a_step_has_the_variance_of_the_process() -> None:
     (*x,) = motion.step(0.1, 1.0)
     assert x[1] == pytest.approx(math.exp(-0.2))
     assert (x[1] * 0.2) ** 2 + x[3] ** 2 + x[4] ** 2 == pytest.approx(0.04)  # the speed stays what it is
+
+
+def misplaced(body: MagnetBody, rng: np.random.Generator) -> MagnetBody:
+    """Return a body whose magnets stand 0.2 mm beside their drawing, per axis, and point 2° beside it."""
+    magnets = []
+    for magnet in body.magnets:
+        turn = Rotation.from_rotvec(math.radians(2.0) * rng.normal(size=3))
+        place = np.array(magnet.position_m) + 2e-4 * rng.normal(size=3)
+        magnets.append(replace(magnet, position_m=tuple(place), moment_Am2=tuple(turn.apply(magnet.moment_Am2))))
+    return replace(body, magnets=magnets)
+
+
+@pytest.mark.parametrize("noise_T", [1e-6, 1e-5])
+def test_stated_errors_of_placement_are_in_the_covariance(noise_T: float) -> None:
+    # Each device has constant errors, so its NEES is one value of χ²/6: the mean of 4 is above 3 once in 100,000.
+    rng = np.random.default_rng(60_30)
+    array, drawn = hall_ring(4, noise_T=noise_T), knob(position_sigma_m=2e-4, direction_sigma_rad=math.radians(2.0))
+    squares = []
+    for seed in range(4):
+        readings, position_m, R = record(array, misplaced(knob(), rng), 150, 60_31 + seed)
+        track = track_body(array, drawn, readings)
+        assert set(track.status) == {"tracked"}
+        squares.append(np.nanmean(nees(track, position_m, R)))
+    assert np.mean(squares) < 3.0
+
+
+def test_errors_of_placement_that_nobody_states_are_flagged() -> None:
+    # 0.2 mm and 2° are a hundred times this noise; of errors near the noise most look like another pose.
+    rng = np.random.default_rng(60_36)
+    array = hall_ring(4)
+    for seed in range(3):
+        readings, position_m, R = record(array, misplaced(knob(), rng), 150, 60_37 + seed)
+        track = track_body(array, knob(), readings)
+        flagged = [bool(flags) or status != "tracked" for flags, status in zip(track.flags, track.status, strict=True)]
+        wrong = nees(track, position_m, R) > 5.0
+        assert (wrong & ~np.array(flagged)).mean() < 0.03  # the first rows of a track are too few to judge it
+
+
+def test_a_noise_that_is_larger_than_stated_is_flagged() -> None:
+    array, body = hall_ring(4), knob()
+    readings, position_m, R = record(replace(array, sensors=hall_ring(4, noise_T=3e-6).sensors), body, 300, 60_39)
+    track = track_body(array, body, readings)
+    late = np.arange(300) >= 50
+    flagged = np.array(
+        [bool(flags) or status != "tracked" for flags, status in zip(track.flags, track.status, strict=True)]
+    )
+    assert flagged[late].mean() > 0.95
+    assert np.nanmean(nees(track, position_m, R)[late]) < 3.0
+
+
+def test_rows_one_by_one_give_the_same_track_with_errors_of_placement() -> None:
+    array, body = hall_ring(4), knob(position_sigma_m=1e-4)
+    readings, _, _ = record(array, body, 30, 60_28)
+    together = track_body(array, body, readings)
+    tracker = BodyTracker(array, body)
+    for i in range(30):
+        point = tracker.follow(readings.values_T[i : i + 1], readings.time_s[i : i + 1])
+        np.testing.assert_allclose(point.position_m[0], together.position_m[i], rtol=1e-9, atol=1e-12)

@@ -164,6 +164,8 @@ class TestCauses:
         poses = locate_body(self.array, knob(), readings_of(self.array, knob(), outside, self.R[:5], self.rng))
         assert not poses.solved.any()
         assert all("outside the limits of the body: x" in reason for reason in poses.reason)
+        for values in (poses.position_m, poses.R, poses.covariance):
+            assert np.isnan(values).all()
 
     def test_a_sensor_inside_a_magnet_is_a_warning(self, caplog: pytest.LogCaptureFixture) -> None:
         body = replace(knob(), limits=PoseLimits())

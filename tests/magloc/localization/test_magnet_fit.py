@@ -202,6 +202,10 @@ class TestArguments:
         with pytest.raises(ValueError, match=r"sources must be|magnet must come without"):
             Locator(board(), magnet=SHAPES[0], **other)
 
+    def test_a_size_in_millimetres(self) -> None:
+        with pytest.raises(ValueError, match=r"larger than the array of .* m. 10 mm are 0.01 m"):
+            array_near(board(), Shape("cylinder", (10.0, 4.0)))
+
     def test_the_shape_stays_with_the_array(self) -> None:
         near = array_near(board(), SHAPES[0])
         assert near.in_ambient_field([0.0, 0.0, 1.0]).magnet == near.subset(near.ids[:4]).magnet == SHAPES[0]

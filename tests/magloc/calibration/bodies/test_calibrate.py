@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2 as chi2_law
 
+from magloc.bodies.locator import locate_body
 from magloc.calibration.bodies.calibrate import BodyPrior, calibrate_body
 from magloc.calibration.bodies.model import across
 from magloc.calibration.bodies.results import BodyCalibration
@@ -146,6 +147,16 @@ class TestUnknownTerms:
         result = one.calibrate(truth=one.truth(slice(30)), free_rows=True, validate=False)
         assert names(result) == TOGETHER | TURNED_TOGETHER | SIZE | GAIN
         assert result.rows.all()
+
+    def test_a_motion_to_the_limits_stays_within_those_of_the_calibrated_body(self) -> None:
+        """An array that stands 0.8 mm beside its drawing, which unknown poses cannot show."""
+        one = case(11, 250)
+        device = replace(one.device, position_m=one.device.position_m + np.array([0.0, 8e-4, 0.0]))
+        readings = device.read(one.position_m, one.rotation, np.random.default_rng(11))
+        result = replace(one, device=device, readings=readings).calibrate(validate=False)
+        assert locate_body(result.array, result.body, readings).solved.all()
+        known = one.calibrate(truth=one.truth(), validate=False)
+        assert known.body.limits == nominal_knob().limits
 
     def test_the_prior_of_a_gauge_is_stated(self) -> None:
         """A common translation of three sensors, 0.5 mm each: 0.5 mm / √3."""

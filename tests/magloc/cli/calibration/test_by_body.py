@@ -56,9 +56,11 @@ class TestOutputs:
         assert "magnet" in done.out
         assert "m3" in done.out
         assert "cross-validation: rows held out" in done.err
+        assert "the calibrated array is not written; array and body belong together: add --out-array FILE" in done.err
 
     def test_the_figure(self, run: Run, options: list[str], tmp_path: Path) -> None:
-        run("calibrate", *options, "--figures", str(tmp_path))
+        done = run("calibrate", *options, "--figures", str(tmp_path))
+        assert "no file is written; --out-array FILE and --out-body FILE write" in done.err
         assert {path.name for path in tmp_path.iterdir()} == {"calibration.png", "calibration.csv"}
 
 
