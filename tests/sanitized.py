@@ -11,7 +11,7 @@ from magloc import core
 from tests.test_core_examples import COMPILER
 
 
-def check_random_updates(source: Path, count: int, folder: Path, optimisation: str = "-O1") -> None:
+def check_random_updates(source: Path, count: int, folder: Path, *flags: str) -> None:
     """Run a program with so many updates in double and in float, and check the counts that it prints."""
     if COMPILER is None:
         pytest.skip("no C++ compiler")
@@ -20,7 +20,8 @@ def check_random_updates(source: Path, count: int, folder: Path, optimisation: s
     command = [
         COMPILER,
         "-std=c++17",
-        optimisation,
+        "-O1",
+        *flags,
         *includes,
         "-Wall",
         "-Wextra",

@@ -1,5 +1,5 @@
 // Random updates of satellite filters: random_updates COUNT. Prints how many it made, how many were refused, and how
-// many estimates were not finite.
+// many estimates were not finite. With QUICK the filters are those with most states, as four take 13 s to compile.
 #include <stdio.h>
 #include <stdlib.h>
 
@@ -59,9 +59,14 @@ void run(long count, long &refused, long &bad) {
 int main(int, char **arguments) {
   const long count = atol(arguments[1]);
   long refused = 0, bad = 0;
+#ifdef QUICK
+  const long part = count;
+#else
+  const long part = count - count / 2;
   run<double>(count / 2, refused, bad);
-  run<double, State::gyro_bias, State::field_model, State::dipole>(count - count / 2, refused, bad);
   run<float, State::gyro_bias>(count / 2, refused, bad);
-  run<float, State::field_bias, State::disturbance, State::field_gain>(count - count / 2, refused, bad);
+#endif
+  run<double, State::gyro_bias, State::field_model, State::dipole>(part, refused, bad);
+  run<float, State::field_bias, State::disturbance, State::field_gain>(part, refused, bad);
   printf("updates %ld\nrefused %ld\nnot_finite %ld\n", 2 * count, refused, bad);
 }
