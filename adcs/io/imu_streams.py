@@ -78,7 +78,7 @@ class ImuStream:
                 row = self._row(line, name)
                 estimate = None if row is None else self._update(*row)
             except ValueError as error:
-                self._fault = self._fault or str(error).rstrip(".")
+                self._fault = self._fault or str(error).rstrip(".").partition(", expected")[0]
                 self.tally.name("garbled", str(error))
                 continue
             if estimate is not None:

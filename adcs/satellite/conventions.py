@@ -108,8 +108,8 @@ def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str
             raise ValueError(
                 "Input telemetry must have a field along the orbit whose modulus is within "
                 f"{100 * _MOST_MODULUS_ERROR:.0f} % (rms) of the model; instead received {far} %, which signs and axes "
-                "of a sensor cannot cause. Check the start, altitude, inclination and node of the orbit first. If they "
-                f"are right, undo this: {', '.join(named)}."
+                "of a sensor cannot cause. Check start, altitude, inclination and node of the orbit. If they are "
+                f"right, undo this: {', or '.join(named[:2])}."
             )
         is_near = _NAMED_MODULUS_ERROR < error <= _MOST_MODULUS_ERROR
         raise ValueError(

@@ -35,13 +35,12 @@ from magloc.localization.locator import Locator
 
 WINDOW_S = 8.0
 """Time before and after a switch; over a longer time the ambient field is no parabola."""
-_DEGREE, _LEAST_ROWS = 2, 6
+_DEGREE, _LEAST_ROWS, _LARGEST_STATE = 2, 6, 1e9
 _AMBIENT_T = 30e-6
 _PRIOR_T = 100e-6  # prior standard deviation of a component of V and o
-_UNKNOWN = 0.5
 LONGEST_LAG_S = 30.0  # largest lag between states and readings that is searched, in both directions
 _Fitted = tuple[FloatArray, FloatArray, FloatArray, int]
-_FALSE_ALARM, _MISFIT = 1e-6, 2.0
+_FALSE_ALARM, _MISFIT, _UNKNOWN = 1e-6, 2.0, 0.5
 _OTHERS = 12  # further unknowns of each magnetometer: its offset, and nine errors of gains and axes
 
 
@@ -364,9 +363,10 @@ def _states(states: Mapping[str, ArrayLike], names: tuple[str, ...], n: int) -> 
         )
     each = [np.asarray(states[name], dtype=np.float64) for name in names]
     for name, values in zip(names, each, strict=True):
-        if values.shape != (n,) or not np.isfinite(values).all():
+        if values.shape != (n,) or not (np.abs(values) <= _LARGEST_STATE).all():
             raise ValueError(
-                f"Input states must be finite with shape ({n},); instead received {values.shape} of {name}."
+                f"Input states must be within ±{_LARGEST_STATE:g} with shape ({n},); instead received {name} with "
+                f"shape {values.shape} and up to {np.abs(values).max():g}. Leave dummy values empty."
             )
     return np.stack(each, axis=1)
 

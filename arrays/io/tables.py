@@ -25,7 +25,7 @@ def by_sigma(value: float, sigma: float) -> tuple[str, str]:
     rounded = float(f"{sigma:.1e}")
     decimals = 1 - math.floor(math.log10(rounded) + 1e-9)
     if decimals > _FINEST or max(abs(value), sigma) >= _LARGEST_TENS:
-        digits = max(0, math.floor(math.log10(max(abs(value), rounded) / rounded) + 1e-9) + 1)
+        digits = decimals + math.floor(math.log10(max(abs(value), rounded)) + 1e-9)
         return f"{value:.{digits}e}", f"{sigma:.1e}"
     shown = max(0, decimals)
     return f"{round(value, decimals) + 0.0:.{shown}f}", f"{rounded:.{shown}f}"

@@ -27,7 +27,16 @@ QUICK, FULL = 6, 3 * len(LINES)  # at the end, each command has met each signal
 CHUNK = 10
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 # The moment is one of our program, not of the interpreter's own start.
-PROGRAM = "import os, sys; from {}.cli.__main__ import main; os.write({}, b'.'); sys.exit(main())"
+PROGRAM = """\
+import importlib, os, sys, types
+from magloc.cli import entry
+from {}.cli.__main__ import main
+def load(name):  # the handlers exist now; a signal before them ends the process as the system does
+    os.write({}, b".")
+    return importlib.import_module(name)
+entry.importlib = types.SimpleNamespace(import_module=load)
+sys.exit(main())
+"""
 
 
 class Case(NamedTuple):

@@ -16,7 +16,7 @@ FULL = Path("/dev/full")
 COMMANDS = [pytest.param(name, marks=[pytest.mark.slow] if name in SELDOM else []) for name in LINES]
 # In `make test` a full standard output is met by a command of each kind of output: text, JSON, lines, rows, nothing.
 QUICK = {"adcs estimate", "adcs imu", "adcs run", "magloc columns", "magloc live", "magloc locate", "magloc new-array"}
-PRINTING_NOTHING = {"magloc new-array", "magloc view", "adcs view"}
+PRINTING_NOTHING = {"magloc new-array", "magloc view", "magloc warm-up", "adcs view", "adcs warm-up"}
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 
 

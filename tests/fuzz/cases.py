@@ -84,7 +84,8 @@ LINES: dict[str, tuple[str, ...]] = {
         "--array log.toml --from replay:log.csv --replay-speed 1e6",
         "--array turned.toml --from replay:turned.csv --replay-speed 1e6 --calibrate --out-array out.toml",
         "--array body-array.toml --body body.toml --from replay:body.csv --replay-speed 1e6",
-        "--array body-array.toml --body body.toml --from replay:body.csv --replay-speed 1e6 --rest-s 0.2 --out out.csv",
+        "--array body-array.toml --body body.toml --from replay:body-rest.csv --replay-speed 1e6 --rest-s 0.2"
+        " --out out.csv",
     ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
@@ -419,6 +420,9 @@ def _write_body(folder: Path) -> None:
     write_body(folder / "body.toml", body)
     times = 0.1 * np.arange(10)
     write_readings(folder / "body.csv", Readings(values_T, time_s=times), array)
+    rest_T = rng.normal(scale=array.sensors[0].noise_T, size=(5, values_T.shape[1]))  # the body is not there yet
+    rested = Readings(np.vstack([rest_T, values_T]), time_s=0.1 * np.arange(15))
+    write_readings(folder / "body-rest.csv", rested, array)
     of_truth = np.column_stack([times, position_m, Rotation.from_matrix(R).as_quat()])
     names = ("time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     write_columns(dict(zip(names, of_truth.T, strict=True)), folder / "body-truth.csv")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -56,8 +57,9 @@ def locate_with_body(
     with naming(str(array), readings=str(readings)):
         poses = locate_body(used, magnets, rows)
     _print(poses, as_json=as_json)
+    _refuse_unsolved(poses, readings)
     _write(poses, out)
-    _note(poses, readings, as_json=as_json)
+    _note(poses, as_json=as_json)
 
 
 def track_with_body(
@@ -84,8 +86,9 @@ def track_with_body(
             print_json(entry)
     else:
         _print(track, as_json=as_json)
+    _refuse_unsolved(track, readings)
     _write(track, out)
-    _note(track, readings, as_json=as_json or jsonl)
+    _note(track, as_json=as_json or jsonl)
 
 
 def motion_of_body(motion: MotionOptions) -> BodyMotion:
@@ -146,15 +149,28 @@ def _write(poses: BodyPoses, out: Path | None) -> None:
     write_files(out, [("poses.png", poses.plot()), ("poses.csv", poses.columns())])
 
 
-def _note(poses: BodyPoses, readings: Path, *, as_json: bool) -> None:
-    """Print what the flags mean; refuse readings without a single pose."""
-    from magloc.bodies.poses import FLAGS
+def _refuse_unsolved(poses: BodyPoses, readings: Path) -> None:
+    """Refuse readings without a single pose."""
+    if not poses.solved.any():
+        raise InputError(f"{readings}: found no row with a pose of the body ({_reasons(poses)}).")
+
+
+def _reasons(poses: BodyPoses) -> str:
+    """Return the reasons of rows without a pose; each limit is one reason, with the values of its first row."""
     from magloc.cli.locate import count_reasons
 
-    reasons = count_reasons(reason for reason in poses.reason if reason)
+    of_rows = [reason for reason in poses.reason if reason]
+    kinds = [re.sub(r": [^:]*, expected [^:]*$", "", reason) for reason in of_rows]
+    first = {kind: reason for kind, reason in reversed(list(zip(kinds, of_rows, strict=True)))}
+    return count_reasons(first[kind] for kind in kinds)
+
+
+def _note(poses: BodyPoses, *, as_json: bool) -> None:
+    """Print what the flags mean."""
+    from magloc.bodies.poses import FLAGS
+
+    reasons = _reasons(poses)
     n = int(poses.solved.sum())
-    if not n:
-        raise InputError(f"{readings}: found no row with a pose of the body ({reasons}).")
     if not as_json:
         note(f"{n} of {len(poses)} rows with a pose" + (f"; not solved: {reasons}" if reasons else ""))
     if poses.symmetry:

@@ -61,7 +61,7 @@ class TestResult:
         np.testing.assert_allclose(M @ M.T, GAIN @ GAIN.T, rtol=0, atol=0.01)
         assert abs(found["time_shift_s"]) < 4.0 * found["sigma_time_shift_s"]
         assert not any("residuals are" in text for text in found["warnings"])
-        assert any("does not tell gain_" in text for text in found["warnings"])
+        assert any("does not determine gain_" in text for text in found["warnings"])
 
     @pytest.mark.slow
     def test_text_and_log(self, adcs, log, tmp_path):

@@ -239,6 +239,11 @@ class TestRefusals:
                 flown.array, flown.readings_T, flown.time_s, flown.gyro_rad_s, {"fan": np.ones(len(flown.time_s))}
             )
 
+    def test_a_dummy_of_a_state(self, flown: LoadsRun) -> None:
+        states = dict(flown.states) | {"radio": np.where(flown.states["radio"] > 0.0, -1e15, 0.0)}
+        with pytest.raises(ValueError, match="received radio with shape .* up to 1e"):
+            find_own_fields(flown.array, flown.readings_T, flown.time_s, flown.gyro_rad_s, states)
+
     def test_shapes(self, flown: LoadsRun) -> None:
         with pytest.raises(ValueError, match="readings_T must have shape"):
             find_own_fields(flown.array, flown.readings_T[:5], flown.time_s, flown.gyro_rad_s, flown.states)

@@ -14,6 +14,7 @@ import arrays
 from magloc.bodies.body_file import write_body
 from magloc.cli.app import main
 from magloc.readings import write_readings
+from tests.fuzz.runner import LONGEST_SENTENCE
 from tests.magloc.bodies.devices import hall_ring, knob
 from tests.magloc.bodies.test_filter import record
 
@@ -110,5 +111,9 @@ def test_readings_of_no_body_end_in_a_reason(
         for row, values in zip(lines[1:], noise, strict=True)
     ]
     Path("n.csv").write_text("\n".join([lines[0], *rows, ""]), encoding="utf-8")
-    assert main(["locate", "n.csv", *GIVEN.split()]) == 2
-    assert "found no row with a pose of the body" in capsys.readouterr().err
+    for command in ("locate", "track"):
+        assert main([command, "n.csv", *GIVEN.split(), "--out", "poses"]) == 2
+        err = capsys.readouterr().err
+        assert "found no row with a pose of the body" in err
+        assert len(err.splitlines()[-1]) <= LONGEST_SENTENCE
+        assert not Path("poses").exists()
