@@ -72,7 +72,8 @@ def run_rows(rows: Array, filter_: adcs.SatelliteFilter, programs: Path, real: s
     if not program.exists():
         folder.mkdir()
         (folder / "satellite.hpp").write_text(header, encoding="utf-8")
-        flags = ["-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{core.include_dir()}", f"-I{folder}"]
+        optimisation = "-O2" if real == "double" else "-O0"  # twice as fast to compile
+        flags = ["-std=c++17", optimisation, "-Wall", "-Wextra", "-Werror", f"-I{core.include_dir()}", f"-I{folder}"]
         command = [COMPILER, *flags, f"-DREAL={real}", str(HERE / "satellite_rows.cpp"), "-o", str(program)]
         subprocess.run(command, check=True)
     text = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in rows)

@@ -104,6 +104,7 @@ class TestRecording:
             pytest.skip("needs the recording magnet-mocap")
         return folder
 
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("unknown_strength", [False, True])
     def test_carries_over(self, recording: Path, tmp_path: Path, run: Run, unknown_strength: bool) -> None:
         truth_path, out = recording / "run3-truth.csv", tmp_path / "array.toml"

@@ -84,6 +84,7 @@ def check_targets(found: magloc.Survey) -> None:
 
 
 class TestHeadingErrors:
+    @pytest.mark.slow_after(1)
     @pytest.mark.parametrize("seed", [6101, 6102])
     def test_unstated(self, seed: int, caplog: pytest.LogCaptureFixture) -> None:
         """Eight times the noise; without the estimate they make targets at the ends of lines."""
