@@ -32,7 +32,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "ObjectPath": "magloc.signature.path",
         "OrnsteinUhlenbeck": "magloc.tracking.motion",
         "PathError": "magloc.signature.path",
-        "Quality": "magloc.deliverables.quality",
+        "Quality": "magloc.deliverables.quality_result",
         "RandomWalk": "magloc.tracking.motion",
         "Readings": "magloc.readings",
         "RepeatedFilter": "magloc.convergence.filters",

@@ -16,8 +16,8 @@ from magloc.compensation.results import Compensation as Compensation
 from magloc.convergence.filters import RepeatedFilter as RepeatedFilter
 from magloc.convergence.over_sources import source_map as source_map
 from magloc.convergence.over_starts import convergence_map as convergence_map
-from magloc.deliverables.quality import Quality as Quality
 from magloc.deliverables.quality import check_quality as check_quality
+from magloc.deliverables.quality_result import Quality as Quality
 from magloc.design.optimise import Design as Design
 from magloc.design.optimise import design_array as design_array
 from magloc.design.task import DesignTask as DesignTask

@@ -12,7 +12,7 @@ from magloc.plots import style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from magloc.deliverables.quality import Quality
+    from magloc.deliverables.quality_result import Quality
 
 _MOST_POINTS = 20_000
 _BLOCKS = 120  # of the noise in time

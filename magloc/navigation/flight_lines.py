@@ -12,6 +12,7 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.navigation.course import chords
 
 _LONGEST_GAP = 20.0  # in usual steps of time
+_ANOTHER_TIME_S = 3600.0  # within one name
 _TURN_deg = 35.0  # smallest angle between the courses before and after a row of a turn
 _SHORTEST = 3.0  # in chords
 _FLAT = 1e-3  # A single line extends less across than this share of its length.
@@ -31,8 +32,8 @@ def flight_lines(
 ) -> list[FlightLine]:
     """Return the lines of a survey in the order of time.
 
-    A line begins where the log names one. Without names it begins after a gap in time and after a turn, and a turn
-    belongs to the line before it.
+    A line begins where the log names one, and after an hour without rows. Without names it begins after a gap in time
+    and after a turn, and a turn belongs to the line before it.
 
     Parameters
     ----------
@@ -59,8 +60,10 @@ def _named_rows(time_s: FloatArray, names: Sequence[tuple[float, str]]) -> Itera
     starts = np.searchsorted(time_s, [start_s for start_s, _ in names]).tolist()
     starts[0] = 0
     for (_, name), ends in zip(names, pairwise([*starts, len(time_s)]), strict=True):
-        if ends[1] - ends[0] > 1:
-            yield name, slice(*ends)
+        gaps = ends[0] + 1 + np.flatnonzero(np.diff(time_s[slice(*ends)]) > _ANOTHER_TIME_S)
+        yield from (
+            (name, slice(*part)) for part in pairwise([ends[0], *gaps.tolist(), ends[1]]) if part[1] > part[0] + 1
+        )
 
 
 def _straight_rows(time_s: FloatArray, place_m: FloatArray) -> Iterator[tuple[str, slice]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -13,15 +13,13 @@ from scipy.interpolate import BSpline, make_lsq_spline
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
-from magloc.navigation.crossovers import ClockShift, clock_shift
+from magloc.navigation.crossovers import ClockShift
 from magloc.navigation.flight_lines import flight_lines
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.piece import Piece, search_rounds
-from magloc.surveying.preparation import field_moduli, without_ambient
 from magloc.surveying.rounds import WHILE_SEARCHING
 
 _STEP_M = 0.05  # step along the path for the curvature of the likelihood
@@ -31,34 +29,59 @@ _APART, _ROUNDS = 0.6, 3  # spacing of lags with a new search, in distances to t
 _MOST_APART = 30  # lags on either side with a new search, which bounds its cost where the carrier is fast
 _WRONG = 1.5  # χ² per reading above which sources may belong to another lag
 _SETTLING = 8  # most repetitions of the search for a lag
-_MISFIT, _SHARE = 2.0, 0.5  # largest χ² per reading, or share of that without a lag
+_MISFIT = 2.0  # largest χ² per reading of sources that show a lag: otherwise it imitates another error
+_FEWEST_LINES = 4  # from whose differences the error of a lag follows
+_OWN = 0.9  # largest share of the curvature by one line: the others would not determine a lag
+_AGREE, _SIGNIFICANT = 3.0, 4.0  # standard deviations of the difference of two estimates, and of a lag
 _ROWS = 6  # rows per knot of a smooth track
 
 
 class ClockLag(NamedTuple):
-    """Delay of the readings in seconds, and its standard deviation."""
+    """Delay of the readings in seconds, its standard deviation, and why it is doubtful, or ""."""
 
     s: float
     sigma_s: float
+    doubt: str = ""
+
+    @property
+    def is_significant(self) -> bool:
+        """True if the readings and poses differ in time."""
+        return self.s != 0.0 and abs(self.s) > _SIGNIFICANT * self.sigma_s
+
+
+UNKNOWN = ClockLag(0.0, math.inf)
 
 
 class Trial(NamedTuple):
-    """Best sources at a lag, minus twice the log-likelihood, and χ² per reading."""
+    """Best sources at a lag, minus twice the log-likelihood, χ² per reading, and χ² of each group with its time."""
 
     lag_s: float
     sources: Sources
     cost: float
     chi2: float
+    of_groups: FloatArray
+    group_s: FloatArray
 
 
-def shift_of_places(array: SensorArray, readings: Readings) -> ClockShift | None:
-    """Return the shift of the places' clock with which opposite lines agree; None if they do not determine it."""
-    place_m = readings.array_position_m
-    if place_m is None or not len(readings):
-        return None
-    values_T = without_ambient(readings, field_moduli(array, readings.values_T)).mean(axis=1)
-    lines = flight_lines(readings.time_s, place_m, place_m[:, 2], readings.lines)
-    return clock_shift(readings.time_s, place_m, values_T, lines)
+def lag_of_lines(clock: ClockShift | None) -> ClockLag:
+    """Return the lag with which opposite lines agree; unknown for a leap, or without such lines."""
+    return UNKNOWN if clock is None or clock.is_leap else ClockLag(-clock.s, clock.sigma_s)
+
+
+def agreed_lag(lines: ClockLag, targets: ClockLag) -> ClockLag:
+    """Return the lag by the targets if opposite lines agree with it, and that by the lines otherwise.
+
+    Errors of the places that last a whole line, sources that are not found and other errors of the model make the fit
+    of the targets certain of a wrong lag. The lines need no model.
+    """
+    if not math.isfinite(lines.sigma_s):
+        return targets
+    if not math.isfinite(targets.sigma_s):
+        return lines
+    if abs(targets.s - lines.s) < _AGREE * math.hypot(targets.sigma_s, lines.sigma_s):
+        return min(targets, lines, key=lambda lag: lag.sigma_s)
+    doubt = f"the targets show {targets.s:.3f} ± {targets.sigma_s:.3f} s, opposite lines {lines.s:.3f}"
+    return lines._replace(doubt=f"{doubt} ± {lines.sigma_s:.3f} s")
 
 
 def by_cost(one: Trial) -> float:
@@ -66,19 +89,25 @@ def by_cost(one: Trial) -> float:
     return one.cost
 
 
-def estimate_lag(piece_at: Callable[[float], Piece], here: Trial | None = None, near: Trial | None = None) -> ClockLag:
-    """Return the likeliest lag of a piece, 0 if it is not significant.
+def estimate_lag(
+    piece_at: Callable[[float], Piece],
+    here: Trial | None = None,
+    near: Trial | None = None,
+    lines: ClockLag = UNKNOWN,
+) -> ClockLag:
+    """Return the likeliest lag of a piece, with its error from the differences of lines.
 
     ``piece_at`` returns the piece with the poses of an earlier time. ``here``: trial without a lag for comparison.
-    ``near``: trial to search around; by default the search covers all lags.
+    ``near``: trial to search around; by default the search begins at the lag of opposite lines, or covers all lags.
     """
     piece = piece_at(0.0)
     model = piece.model()
     way = np.linalg.norm(np.diff(model.record.middles_m, axis=0), axis=1)
     speed = float(np.median(way / np.diff(model.record.time_s)))
     if not len(piece.known) or speed * _MOST_S < _STEP_M:
-        return ClockLag(0.0, math.inf)
+        return UNKNOWN
     step, apart = _STEP_M / speed, _APART * model.nearest_m / speed
+    starts_s = _starts_of_lines(piece.readings)
 
     def best_near(lag: Trial) -> Trial:
         """Return the likeliest trial near another one, starting from its sources."""
@@ -94,43 +123,79 @@ def estimate_lag(piece_at: Callable[[float], Piece], here: Trial | None = None, 
         """Return the trials one step before and after a trial."""
         return [fit_at_lag(piece_at, lag.lag_s + sign * step, lag.sources) for sign in (-1.0, 1.0)]
 
-    def beside(lag: Trial) -> tuple[float, float]:
-        """Return slope and curvature of the cost."""
-        before, after = (side.cost for side in sides(lag))
-        return (after - before) / (2.0 * step), (before - 2.0 * lag.cost + after) / step**2
-
     here = fit_at_lag(piece_at, 0.0, piece.known) if here is None else here
-    if near is None:
-        slope, curvature = beside(here)
-        if (
-            here.chi2 < _WRONG
-            and curvature > 0.0
-            and slope**2 < 2.0 * curvature * model.threshold * max(1.0, here.chi2)
-        ):
-            return ClockLag(0.0, math.sqrt(2.0 / curvature))
+    if near is not None:
+        at = best_near(near)
+    else:
+        beside = _Parabola.of(here, sides(here), starts_s)
+        if here.chi2 < _WRONG and beside.is_at_rest(model.threshold * max(1.0, here.chi2)) and not lines.is_significant:
+            return ClockLag(-beside.slope / beside.curvature, beside.sigma_s)
         at = best_near(here)
-        if at.chi2 > _WRONG:  # each source may be found twice, once for each direction of travel
+        if lines.is_significant:
+            at = min(at, best_near(fit_at_lag(piece_at, lines.s, None)), key=by_cost)
+        elif at.chi2 > _WRONG:  # each source may be found twice, once for each direction of travel
             n = min(math.ceil(_MOST_S / apart), _MOST_APART)
             most_s = min(_MOST_S, n * apart)
             lags = np.linspace(-most_s, most_s, 2 * n + 1).tolist()
             new = [fit_at_lag(piece_at, lag_s, None) for lag_s in lags]
             here = min(here, new[n], key=by_cost)
             at = min(at, best_near(min(new, key=by_cost)), key=by_cost)
-    else:
-        at = best_near(near)
     here = min(here, fit_at_lag(piece_at, 0.0, at.sources), key=by_cost)  # a search may have found more
-    explained = at.chi2 < max(_MISFIT, _SHARE * here.chi2)  # otherwise a lag imitates another error
-    if not explained or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
-        return ClockLag(0.0, math.inf)
+    if at.chi2 > _MISFIT or here.cost - at.cost < model.threshold * max(1.0, at.chi2):
+        return UNKNOWN
     for _ in range(_SETTLING):  # sources found at another lag bias the search
         again = best_near(min([fit_at_lag(piece_at, at.lag_s, None), *sides(at)], key=by_cost))
         settled = again.cost > at.cost - 1.0
         at = min(at, again, key=by_cost)
         if settled:
             break
-    slope, curvature = beside(at)
-    lag_s = at.lag_s - slope / curvature if curvature > 0.0 else math.inf
-    return ClockLag(lag_s, math.sqrt(2.0 / curvature)) if abs(lag_s) < _MOST_S else ClockLag(0.0, math.inf)
+    beside = _Parabola.of(at, sides(at), starts_s)
+    lag_s = at.lag_s - beside.slope / beside.curvature if beside.curvature > 0.0 else math.inf
+    return ClockLag(lag_s, beside.sigma_s) if abs(lag_s) < _MOST_S else UNKNOWN
+
+
+class _Parabola(NamedTuple):
+    """Slope and curvature of the cost beside a lag, and the error of its lowest point."""
+
+    slope: float
+    curvature: float
+    sigma_s: float
+
+    @classmethod
+    def of(cls, at: Trial, sides: Sequence[Trial], starts_s: FloatArray) -> _Parabola:
+        """Return the parabola through a trial and those before and after it.
+
+        The error is the larger one of that by the curvature and that by leaving out each line.
+        """
+        before, after = sides
+        step = 0.5 * (after.lag_s - before.lag_s)
+        costs = np.array([[trial.cost, *_cost_of_lines(trial, starts_s)] for trial in (before, at, after)])
+        slopes, curvatures = (costs[2] - costs[0]) / (2.0 * step), (costs[0] - 2.0 * costs[1] + costs[2]) / step**2
+        slope, curvature = float(slopes[0]), float(curvatures[0])
+        n = len(starts_s)
+        if curvature <= 0.0 or n < _FEWEST_LINES:
+            return cls(slope, curvature, math.inf)
+        left = curvature - np.minimum(curvatures[1:], _OWN * curvature)
+        by_lines = math.sqrt((n - 1) / n * float(np.sum(((slopes[1:] - slopes[1:].mean()) / left) ** 2)))
+        return cls(slope, curvature, max(math.sqrt(2.0 * max(1.0, at.chi2) / curvature), by_lines))
+
+    def is_at_rest(self, least_gain: float) -> bool:
+        """Return whether the lowest point gains less."""
+        return self.curvature > 0.0 and self.slope**2 < 2.0 * self.curvature * least_gain
+
+
+def _starts_of_lines(readings: Readings) -> FloatArray:
+    """Return the times (L,) at which the lines of some rows begin."""
+    place_m = readings.array_position_m
+    assert place_m is not None
+    lines = flight_lines(readings.time_s, place_m, place_m[:, 2], readings.lines)
+    return np.array([readings.time_s[line.rows.start] for line in lines])
+
+
+def _cost_of_lines(trial: Trial, starts_s: FloatArray) -> FloatArray:
+    """Return χ² of each line (L,)."""
+    line = np.maximum(np.searchsorted(starts_s, trial.group_s, "right") - 1, 0)
+    return np.bincount(line, trial.of_groups, len(starts_s)).astype(np.float64)
 
 
 def fit_at_lag(piece_at: Callable[[float], Piece], lag_s: float, start: Sources | None) -> Trial:
@@ -141,7 +206,10 @@ def fit_at_lag(piece_at: Callable[[float], Piece], lag_s: float, start: Sources 
     group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
     fit, background = model.refit(start, group)
     cost = fit.cost + background.noise_log_determinant + model.threshold * len(fit.sources)
-    return Trial(lag_s, fit.sources, cost, fit.cost / fit.residual.size)
+    left = fit.residual * (fit.residual - background.Q @ (background.Q.T @ fit.residual))
+    of_groups = left.reshape(background.white.n_groups, -1).sum(axis=1)
+    first_s = model.record.time_s[background.white.starts[:-1]]
+    return Trial(lag_s, fit.sources, cost, fit.cost / fit.residual.size, of_groups, first_s)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
@@ -15,7 +16,7 @@ from magloc.measurement.rows import check_magnitudes, check_order
 from magloc.measurement.screening import wild_readings
 from magloc.navigation.course import APART_M
 from magloc.navigation.fixes import between_fixes, interval_of_fixes
-from magloc.navigation.flight_lines import rows_of_turns
+from magloc.navigation.flight_lines import FlightLine, flight_lines, rows_of_turns
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.error_components import unstated_pose
@@ -34,6 +35,9 @@ FASTEST_M_S = 300.0
 """Speed between two rows above which their places leap."""
 _BLOCK = 2**18  # rows per block
 _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the best sensor
+_LEAST_DIGIT_T = 1e-14  # smaller steps are rounding errors
+_STILL, _LAST_DIGITS = 50, 2.0  # rows within so many steps of the last digit, although the noise is larger
+_STILL_ALONE, _OTHERS = 200, 100.0  # the same, although another sensor changes by so many steps
 
 
 def whole_rows(
@@ -149,7 +153,10 @@ def _jitter_m(array: SensorArray, readings: Readings) -> float:
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
-    """Return rows and sensors (n, N) in long runs of one reading while others change, or in the whole log."""
+    """Return rows and sensors (n, N) in long runs of one reading while others change, or in the whole log.
+
+    A sensor is also stuck if only its last digit changes.
+    """
     n = len(values)
     lengths = np.empty((n, array.n_sensors))
     for i in range(array.n_sensors):
@@ -159,7 +166,38 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
         lengths[:, i] = np.bincount(run)[run]
     typical = [len(column) / np.sum(1.0 / column) for column in lengths.T]  # mean length of a run
     least = min(typical, default=math.inf)
-    return np.asarray(lengths > _LONGEST_RUN * (1.0 if least >= n else least))  # a log of one reading shows no field
+    runs = lengths > _LONGEST_RUN * (1.0 if least >= n else least)  # a log of one reading shows no field
+    return np.asarray(runs | _still_readings(array, values))
+
+
+def _still_readings(array: SensorArray, values: FloatArray) -> BoolArray:
+    """Return rows and sensors (n, N) that change by two steps of the last digit at most.
+
+    The noise of the sensor is larger, or another sensor changes much more.
+    """
+    out = np.zeros((len(values), array.n_sensors), np.bool_)
+    known = [np.flatnonzero(np.isfinite(column)) for column in values.T]
+    if len(values) < _STILL_ALONE or not all(map(len, known)):
+        return out
+    rows = np.arange(len(values))
+    whole = np.stack([np.interp(rows, at, column[at]) for at, column in zip(known, values.T, strict=True)], axis=1)
+    steps = np.abs(np.diff(whole, axis=0))
+    digit = np.where(steps > _LEAST_DIGIT_T, steps, np.inf).min(axis=0)
+    fourth = np.abs(np.diff(whole, 4, axis=0)) / math.sqrt(70.0)
+    is_finer = np.median(fourth, axis=0) > _LAST_DIGITS * digit
+
+    def span(size: int) -> FloatArray:
+        return np.asarray(maximum_filter1d(whole, size, axis=0) - minimum_filter1d(whole, size, axis=0))
+
+    brief, long = span(_STILL), span(_STILL_ALONE)
+    for i in range(array.n_sensors):
+        own = array.channel_sensor == i
+        most = _LAST_DIGITS * digit[own] * (1.0 + 1e-6)
+        others = (long[:, ~own] > _OTHERS * digit[own].max()).any(axis=1)
+        is_still = (brief[:, own] <= most).all(axis=1) & is_finer[own].all()
+        is_still_alone = (long[:, own] <= most).all(axis=1) & others
+        out[:, i] = maximum_filter1d(is_still, _STILL - 1) | maximum_filter1d(is_still_alone, _STILL_ALONE - 1)
+    return out
 
 
 def without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
@@ -167,6 +205,14 @@ def without_ambient(rows: Readings, moduli_T: FloatArray) -> FloatArray:
     if rows.ambient_T is None:
         return moduli_T
     return np.asarray(moduli_T - np.linalg.norm(rows.ambient_T, axis=1)[:, None])
+
+
+def variations_of_lines(array: SensorArray, rows: Readings) -> tuple[FloatArray, list[FlightLine]]:
+    """Return the moduli (n, N) less that of the ambient field, and the lines of the rows."""
+    place_m = rows.array_position_m
+    assert place_m is not None
+    variations_T = without_ambient(rows, field_moduli(array, rows.values_T))
+    return variations_T, flight_lines(rows.time_s, place_m, place_m[:, 2], rows.lines)
 
 
 def leaping_rows(readings: Readings) -> BoolArray:

@@ -14,16 +14,19 @@ from pathlib import Path
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
+from arrays.typing import FloatArray
 from magloc import core
 from magloc.grids.work import workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.rows import concatenate_readings
+from magloc.navigation.crossovers import clock_shift
+from magloc.navigation.flight_lines import FlightLine
 from magloc.readings import Readings
-from magloc.surveying.clock import shift_of_places
-from magloc.surveying.fit.sensor_order import size_of_anomalies, weaker_sensors_below
+from magloc.surveying.clock import lag_of_lines
+from magloc.surveying.fit.sensor_order import exchanged_beside, size_of_anomalies, weaker_sensors_below
 from magloc.surveying.piece import Ground, significant_sources, strongest_sources
-from magloc.surveying.preparation import whole_rows, with_places_between_fixes
+from magloc.surveying.preparation import variations_of_lines, whole_rows, with_places_between_fixes
 from magloc.surveying.results import Survey
 from magloc.surveying.review.state import SurveyState
 from magloc.surveying.tiled import Tell, TiledSurvey
@@ -146,15 +149,20 @@ def survey(
         with_offsets = tiled.with_likeliest_offsets()
         again = tiled.changes() if with_offsets is tiled else range(len(tiled.tiles))
         tiled, _ = with_offsets.settle(strongest_sources, each, tell, again)
-        _warn_of_order(tiled.array, tiled.readings)
-        clock = shift_of_places(tiled.array, tiled.readings)
-        tiled, lag = tiled.correct_lag(assumed)
-        if clock is not None and clock.s and (clock.is_leap or not lag.s):
+        rows = tiled.readings
+        assert rows.array_position_m is not None
+        variations_T, lines = variations_of_lines(tiled.array, rows)
+        _warn_of_order(tiled.array, rows, variations_T, lines)
+        clock = clock_shift(rows.time_s, rows.array_position_m, variations_T.mean(axis=1), lines)
+        tiled, lag = tiled.correct_lag(assumed, lag_of_lines(clock))
+        if clock is not None and clock.is_significant and (clock.is_leap or not lag.is_significant):
             _LOG.warning(clock.warning)
-        if lag.s:
+        if lag.doubt:
+            _LOG.warning(f"the lag between readings and poses is doubtful: {lag.doubt}")
+        if lag.is_significant:
             _LOG.warning(
-                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show;"
-                " this is corrected"
+                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as targets and opposite"
+                " lines show; this is corrected"
             )
             tiled, _ = tiled.settle(strongest_sources, each, tell)
         tiled, due = tiled.settle(significant_sources, each, tell)
@@ -162,21 +170,27 @@ def survey(
             _LOG.warning(
                 f"{len(due)} of {len(tiled.tiles)} tiles differ from their neighbours in the sources at their edges"
             )
-        found = SurveyState(tiled, assumed, lag.s).measure(each, tell)
+        found = SurveyState(tiled, assumed, lag.s if lag.is_significant else 0.0).measure(each, tell)
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
     return replace(found, seconds=time.monotonic() - began)
 
 
-def _warn_of_order(array: SensorArray, rows: Readings) -> None:
-    """Warn of sensors whose anomalies exceed those of sensors below them."""
-    weaker = weaker_sensors_below(array, rows, size_of_anomalies(array, rows))
+def _warn_of_order(array: SensorArray, rows: Readings, variations_T: FloatArray, lines: Sequence[FlightLine]) -> None:
+    """Warn of sensors that appear exchanged, with one below them or beside them."""
+    weaker = weaker_sensors_below(array, rows, size_of_anomalies(variations_T, lines))
     for upper, lower in zip(array.ids, weaker, strict=True):
         if lower:
             _LOG.warning(
                 f"sensor {upper} shows larger anomalies than sensor {lower} below it, expected smaller ones: are their"
                 " columns or positions exchanged?"
             )
+    pair = exchanged_beside(array, rows, variations_T, lines)
+    if pair is not None:
+        _LOG.warning(
+            f"sensors {pair[0]} and {pair[1]} appear exchanged: lines of opposite directions agree better the other way"
+            " round. Check their columns, their positions and the sense of the course"
+        )
 
 
 def tile_rows(

@@ -16,7 +16,7 @@ from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.plausibility import robust_sigma
 from magloc.readings import Readings
-from magloc.surveying.clock import ClockLag, SmoothTrack, Trial, estimate_lag, fit_at_lag
+from magloc.surveying.clock import UNKNOWN, ClockLag, SmoothTrack, Trial, agreed_lag, estimate_lag, fit_at_lag
 from magloc.surveying.error_components import with_likeliest_offsets, with_likeliest_pose
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.fit.sensor_noise import white_noise_T
@@ -214,11 +214,22 @@ class TiledSurvey:
         """Return the tile with most sources, which determines common parameters best."""
         return int(np.argmax([len(sources) for sources in self.found]))
 
-    def correct_lag(self, pose_assumed: bool) -> tuple[TiledSurvey, ClockLag]:
-        """Return the survey without lag, and the lag, estimated from one tile without its margin.
+    def correct_lag(self, pose_assumed: bool, lines: ClockLag = UNKNOWN) -> tuple[TiledSurvey, ClockLag]:
+        """Return the survey without lag, and the lag, from the targets of one tile and from opposite lines.
 
-        If there is a lag, the sources are unknown again. Position errors that last a whole line resemble a lag, so that
-        assumed pose errors are estimated both with and without it.
+        If there is a lag, the sources are unknown again.
+        """
+        lag = agreed_lag(lines, self._lag_of_targets(pose_assumed, lines))
+        if not lag.is_significant:
+            return self, lag
+        readings = SmoothTrack.of(self.readings).with_earlier_poses(lag.s)
+        return replace(self._without_sources(), readings=readings), lag
+
+    def _lag_of_targets(self, pose_assumed: bool, lines: ClockLag) -> ClockLag:
+        """Return the lag by the targets of one tile without its margin.
+
+        Position errors that last a whole line resemble a lag, so that assumed pose errors are estimated both with and
+        without it.
         """
         number = self._richest()
         tile = self.tiles[number]
@@ -249,17 +260,15 @@ class TiledSurvey:
             assert pose is not None
             size_m = math.hypot(pose.position_m, pose.position_white_m)
             white = replace(self.array, pose=replace(pose, position_m=size_m, correlation_s=0.0, position_white_m=0.0))
-            lag = estimate_lag(lambda lag_s: replace(piece_at(lag_s), array=white))  # white errors resemble no lag
+            # White errors resemble no lag.
+            lag = estimate_lag(lambda lag_s: replace(piece_at(lag_s), array=white), lines=lines)
             for _ in range(_POSES if lag.s else 0):
                 posed, near = at_likeliest_pose(lag.s, None)
                 lag = estimate_lag(posed, here, near)
                 if not lag.s:
                     break
-        else:
-            lag = estimate_lag(piece_at)
-        if not lag.s:
-            return self, lag
-        return replace(self._without_sources(), readings=track.with_earlier_poses(lag.s)), lag
+            return lag
+        return estimate_lag(piece_at, lines=lines)
 
     def with_likeliest_pose(self) -> TiledSurvey:
         """Return the survey with the pose errors estimated from the sources of one tile."""

@@ -20,5 +20,5 @@ def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 def without_lag(monkeypatch: pytest.MonkeyPatch) -> None:
     """Estimate no lag of the clock, which takes most of the time of a short survey."""
     monkeypatch.setattr(
-        "magloc.surveying.tiled.TiledSurvey.correct_lag", lambda tiled, _: (tiled, ClockLag(0.0, math.inf))
+        "magloc.surveying.tiled.TiledSurvey.correct_lag", lambda tiled, *_: (tiled, ClockLag(0.0, math.inf))
     )

@@ -183,7 +183,7 @@ class TestArrays:
         assert main(["bounds", *map(str, options), *QUICK]) == 0
         out, err = capsys.readouterr()
         assert "Only 3 of the six combinations" in out
-        assert "no detection range: Input array must give at least 6 independent differences" in err
+        assert "no detection range: array must give at least 6 independent differences" in err
 
     @with_plain_pictures
     def test_scalar_sensors_without_an_ambient_field_are_warned_of(self, tmp_path, capsys):

@@ -83,7 +83,7 @@ class TestLines:
         found = entries(outcome.out)
         assert [entry["status"].startswith("rest") for entry in found] == [True] * 10 + [False] * (N_ROWS - 10)
         assert "the background is taken from 10 rows" in outcome.err
-        assert "was the array at rest?" in outcome.err  # a source passes
+        assert "expected an array that does not move" in outcome.err  # a source passes
 
     def test_table_has_the_columns_of_track(self, folder: Path, run: Run, tmp_path: Path) -> None:
         options = ("--array", folder / "array.toml", *MOTION)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import arrays
 import magloc
 from arrays.typing import FloatArray
-from magloc.surveying.clock import SmoothTrack
+from magloc.surveying.clock import UNKNOWN, ClockLag, SmoothTrack, agreed_lag
 
 AMBIENT_T = np.array([1.3e-6, 20.4e-6, -43.9e-6])
 PLACES_M = np.array([[2.0, 0.9, -0.45], [5.0, 2.4, -0.6], [9.0, 1.3, -0.5]])
@@ -97,6 +97,28 @@ class TestTakenEarlier:
         np.testing.assert_allclose(stormy, quiet * storm, rtol=1e-6)
 
 
+class TestAgreedLag:
+    """Two estimates of one lag."""
+
+    LINES = ClockLag(-0.515, 0.03)
+
+    def test_agreement(self) -> None:
+        """The smaller error counts."""
+        assert agreed_lag(self.LINES, ClockLag(-0.48, 0.01)) == ClockLag(-0.48, 0.01)
+        assert agreed_lag(self.LINES, ClockLag(-0.48, 0.09)) == self.LINES
+
+    def test_disagreement(self) -> None:
+        """Lines need no model; the doubt states both."""
+        found = agreed_lag(self.LINES, ClockLag(-0.269, 0.008))
+        assert found[:2] == self.LINES[:2]
+        assert found.doubt == "the targets show -0.269 ± 0.008 s, opposite lines -0.515 ± 0.030 s"
+
+    def test_one_of_them(self) -> None:
+        assert agreed_lag(UNKNOWN, ClockLag(0.2, 0.01)) == ClockLag(0.2, 0.01)
+        assert agreed_lag(self.LINES, UNKNOWN) == self.LINES
+        assert not agreed_lag(UNKNOWN, UNKNOWN).is_significant
+
+
 class TestLag:
     """A claim is one of five standard deviations: no seed was chosen."""
 
@@ -112,6 +134,15 @@ class TestLag:
             error = target.position_m - PLACES_M[np.linalg.norm(PLACES_M - target.position_m, axis=1).argmin()]
             # χ² of three: 1 in 10,000 right ones is beyond 21.
             assert error @ np.linalg.solve(target.covariance[:3, :3], error) < 21.0
+
+    @pytest.mark.slow
+    def test_errors_of_places_that_last_a_line(self) -> None:
+        """0.3 m, of which the array states 5 cm: 0.11 s in the mean of 7 lines. Five σ, and not one of white errors."""
+        each = 0.3 * np.random.default_rng(5).standard_normal((7, 3)) * [1.0, 1.0, 0.0]
+        found = magloc.check_quality(ARRAY, walked(0.5, np.repeat(each, 110, axis=0)))
+        assert found.lag is not None
+        assert found.lag.s == pytest.approx(0.5, abs=5.0 * max(found.lag.sigma_s, 0.0))
+        assert found.lag.sigma_s > 0.02
 
     @pytest.mark.slow
     def test_a_lag_beyond_the_first_interval(self) -> None:
