@@ -1,6 +1,6 @@
 """Twenty-four magnets in beating tissue in one filter: ``python -m docs.studies.beating_tissue --out beating.png``.
 
-The recording `curibio`: 24 wells, each with a magnet some 5 mm over three sensors, 100 rows a second. Prints
+The recording `curibio`: 24 wells, each with a magnet some 5 mm over three sensors of its own, 100 rows a second. Prints
 whether any two tracks came near each other, how far each magnet moved and what a row took, and draws how they move.
 """
 
@@ -99,7 +99,7 @@ def main() -> None:
     """Follow the magnets, and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rows", type=int, default=10_000)
-    parser.add_argument("--without", default="", help="a sensor to exclude")
+    parser.add_argument("--without", default="", help="a sensor that is left out")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     array = plate()
