@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.filter import BodyTracker, track_body
-from magloc.bodies.track import BodyMotion, BodyTrack
+from magloc.bodies.locator import locate_body
+from magloc.bodies.poses import BodyPoses
+from magloc.bodies.track import BodyMotion
 from magloc.chi_square import normalised_square
 from magloc.fields.shapes import Shape
 from magloc.readings import Readings
@@ -40,7 +43,7 @@ def record(array: SensorArray, body: MagnetBody, n: int, seed: int) -> tuple[Rea
     return Readings(readings_of(steady, body, position_m, R, rng) + ambient, time_s=t), position_m, R
 
 
-def nees(track: BodyTrack, position_m: np.ndarray, R: np.ndarray) -> np.ndarray:
+def nees(track: BodyPoses, position_m: np.ndarray, R: np.ndarray) -> np.ndarray:
     turn = (Rotation.from_matrix(R).inv() * track.rotation).inv().as_rotvec()
     error = np.concatenate([position_m - track.position_m[:, 0], turn], axis=1)
     return np.where(track.solved, normalised_square(error, track.covariance[:, 0]) / 6.0, np.nan)
@@ -201,3 +204,38 @@ def test_rows_one_by_one_give_the_same_track_with_errors_of_placement() -> None:
     for i in range(30):
         point = tracker.follow(readings.values_T[i : i + 1], readings.time_s[i : i + 1])
         np.testing.assert_allclose(point.position_m[0], together.position_m[i], rtol=1e-9, atol=1e-12)
+
+
+def reversed_magnets(body: MagnetBody, *ids: str) -> MagnetBody:
+    magnets = [replace(m, moment_Am2=tuple(-np.array(m.moment_Am2))) if m.id in ids else m for m in body.magnets]
+    return replace(body, magnets=magnets)
+
+
+def exchanged(body: MagnetBody) -> MagnetBody:
+    """The first two magnets in each other's place."""
+    one, other, *rest = body.magnets
+    places = (replace(one, position_m=other.position_m), replace(other, position_m=one.position_m))
+    return replace(body, magnets=[*places, *rest])
+
+
+HOSTILE = {
+    "all reversed": (lambda body: reversed_magnets(body, *body.ids), lambda values, rng: values),
+    "one reversed": (lambda body: reversed_magnets(body, "m1"), lambda values, rng: values),
+    "exchanged": (exchanged, lambda values, rng: values),
+    "left-handed axes": (lambda body: body, lambda values, rng: values * np.tile([1.0, -1.0, 1.0], 5)),
+    "gain of -1": (lambda body: body, lambda values, rng: np.where(np.arange(15) == 4, -values, values)),
+    "noise ten times larger": (lambda body: body, lambda values, rng: values + 1e-5 * rng.normal(size=values.shape)),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+@pytest.mark.parametrize("follow", [locate_body, track_body])
+def test_hostile_input_is_flagged_or_consistent(case: str, follow: Callable[..., BodyPoses]) -> None:
+    array, body = hall_ring(5), knob()
+    readings, position_m, R = record(array, body, 8, 60_60)
+    of_body, of_values = HOSTILE[case]
+    values = of_values(readings.values_T, np.random.default_rng(60_61))
+    found = follow(array, of_body(body), Readings(values, time_s=readings.time_s))
+    squares = nees(found, position_m, R)
+    flagged = np.array([bool(flags or reason) for flags, reason in zip(found.flags, found.reason, strict=True)])
+    assert (flagged | (squares < 3.0)).all()
