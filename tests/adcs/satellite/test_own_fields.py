@@ -241,7 +241,7 @@ class TestRefusals:
 
     def test_a_dummy_of_a_state(self, flown: LoadsRun) -> None:
         states = dict(flown.states) | {"radio": np.where(flown.states["radio"] > 0.0, -1e15, 0.0)}
-        with pytest.raises(ValueError, match="received radio with shape .* up to 1e"):
+        with pytest.raises(ValueError, match=r"received radio with shape .* up to 1e"):
             find_own_fields(flown.array, flown.readings_T, flown.time_s, flown.gyro_rad_s, states)
 
     def test_shapes(self, flown: LoadsRun) -> None:
