@@ -18,7 +18,7 @@ from magloc import core
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.locator import BodyLocator
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
-from magloc.bodies.search import fit_problem, packed, unpacked
+from magloc.bodies.search import fit_problem, packed, signals_of_rows, unpacked
 from magloc.bodies.track import BodyMotion, BodyTrack
 from magloc.bodies.track_rows import TrackRows, joined_rows
 from magloc.chi_square import quantile
@@ -193,7 +193,7 @@ class _TrackProblem:
         )
         limits = {int(d): quantile(int(d), CONTRADICTION) for d in np.unique(rows.n_differences)}
         self.limits = np.array([limits[int(d)] for d in rows.n_differences])
-        self._signals = signals_of(rows.model, rows.y)
+        self._signals = signals_of_rows(rows.model, rows.y)
         a = rows.effects.shape[1]
         index = np.repeat(np.arange(n), a)
         flat = signals_of(rows.model.rows(index), rows.effects.reshape(n * a, rows.effects.shape[2])) if a else None
@@ -263,7 +263,7 @@ class _TrackProblem:
             )
         work = core.problem(
             "pose_track",
-            fit=fit_problem(self.rows.model, self._signals, body, np.arange(row, end), _MAX_ITERATIONS),
+            fit=fit_problem(self.rows.model, body, self._signals, np.arange(row, end), _MAX_ITERATIONS),
             n_magnet_errors=body.moment_root.shape[1],
             n_sensor_errors=self.rows.effects.shape[1],
             max_iterations=_MAX_ITERATIONS,

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,12 @@ from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import placed_magnets
 from magloc.bodies.fit import linearise, refine_poses
 from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_places
-from magloc.bodies.poses import BodyPoses
+from magloc.bodies.poses import BodyPoses, enlarged, with_bends
 from magloc.bodies.search import (
     KEEP_WITHIN,
     N_CANDIDATES,
     N_STARTS,
+    PoseOptima,
     PoseTable,
     pose_table,
     refine_dipoles,
@@ -43,7 +45,6 @@ _ROWS_AT_ONCE = 2048
 _LIMIT_SIGMAS = 3.0
 _OPEN_SIGMA_RAD = np.pi / np.sqrt(3.0)  # of an angle that may be anything
 _ABSENT = 1e-9
-_LARGEST_BEND = 0.3  # beyond it the mean NEES of simulated rows is 2
 _ROUNDS, _UNSETTLED = 5, 3.0
 _NO_POSE = "no start leads to a pose that fits"
 
@@ -119,18 +120,17 @@ class BodyLocator:
                 f" {self.n_unknowns} are needed"
             )
             return replace(poses, reason=[reason] * n)
-        optima = self._optima(rows, self._dipoles)
-        poses = self._poses(rows, optima, dof)
-        detected = is_detected(rows.energy, rows.n_differences)
-        for i in np.flatnonzero(rows.is_silent | ~detected).tolist():
+        found = self._found(rows, self._dipoles)
+        absent = rows.is_silent | ~is_detected(rows.energy, rows.n_differences)
+        if found.is_plain.all() and not absent.any():
+            return with_bends(self._poses_of(RowOptima.of(found), dof), found.bend)
+        poses = self._poses(rows, self._optima(rows, self._dipoles, found), dof)
+        for i in np.flatnonzero(absent).tolist():
             poses.reason[i] = NO_SIGNAL if rows.is_silent[i] else "nothing stands out of the noise"
             poses.chi2[i] = np.nan
         if self.find_causes and dof > 0:
             self._name_causes(rows, poses, ambient_T)
-        poses = _enlarged(poses)
-        for i in np.flatnonzero(self._bends(rows, poses) > _LARGEST_BEND).tolist():
-            poses.flags[i] = (*poses.flags[i], "bent")
-        return poses
+        return with_bends(enlarged(poses), self._bends(rows, poses))
 
     def _bends(self, rows: WhitenedRows, poses: BodyPoses) -> FloatArray:
         """Return how far readings bend over one standard deviation of the best poses (n,), in units of the noise."""
@@ -147,17 +147,23 @@ class BodyLocator:
             self._tables[key] = pose_table(rows.model, self.array, body, n)
         return self._tables[key]
 
-    def _optima(self, rows: WhitenedRows, body: MagnetBody) -> RowOptima:
+    def _found(self, rows: WhitenedRows, body: MagnetBody, *, again: bool = False) -> PoseOptima:
+        """Return what the kernel finds for rows, with more candidates and starts in a second search."""
+        n_candidates, n_starts = (_MORE_CANDIDATES, _MORE_STARTS) if again else self._search_size
+        exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
+        judged = exact and self.symmetry.order == 1 and self.symmetry.axis is None
+        credible = quantile(max(rows.n_differences - self.n_unknowns, 1), 1.0 - CREDIBLE_FIT) if judged else -np.inf
+        table, keep_within = self._table(rows, body, n_candidates), KEEP_WITHIN if exact else np.inf
+        return search_poses(rows.model, rows.y, table, n_starts=n_starts, keep_within=keep_within, most_chi2=credible)
+
+    def _optima(self, rows: WhitenedRows, body: MagnetBody, found: PoseOptima | None = None) -> RowOptima:
         """Return the distinct optima of rows, after a second search for those that no pose fits."""
-        wide = self.body.limits.angle_rad > _WIDE_RAD or not self.body.limits.is_bounded
-        optima = self._search(
-            rows, body, 2 * N_CANDIDATES if wide else N_CANDIDATES, 3 * N_STARTS if wide else N_STARTS
-        )
+        optima = self._settled_optima(rows, body, found or self._found(rows, body))
         dof = max(rows.n_differences - self.n_unknowns, 1)
         doubtful = ~(optima.chi2[:, 0] < quantile(dof, 1.0 - CREDIBLE_FIT))
         if doubtful.any():
             some = rows.select(doubtful)
-            again = self._search(some, body, _MORE_CANDIDATES, _MORE_STARTS)
+            again = self._settled_optima(some, body, self._found(some, body, again=True))
             before = np.nan_to_num(optima.chi2[doubtful, 0], nan=np.inf)
             better = np.nan_to_num(again.chi2[:, 0], nan=np.inf) < before
             width = max(again.chi2.shape[1], optima.chi2.shape[1])
@@ -165,14 +171,10 @@ class BodyLocator:
             optima.put(np.flatnonzero(doubtful)[better], RowOptima(*(v[better] for v in vars(again).values())))
         return optima
 
-    def _search(self, rows: WhitenedRows, body: MagnetBody, n_candidates: int, n_starts: int) -> RowOptima:
-        """Return the distinct optima of rows within Δχ² 20 and within the body's limits, best first."""
-        exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
-        table = self._table(rows, body, n_candidates)
-        keep_within = KEEP_WITHIN if exact else np.inf
-        found = search_poses(rows.model, rows.y, body, table, n_starts=n_starts, keep_within=keep_within)
-        optima = RowOptima(found.position_m, found.R, found.chi2, found.covariance)
-        if body is self._dipoles and not exact:
+    def _settled_optima(self, rows: WhitenedRows, body: MagnetBody, found: PoseOptima) -> RowOptima:
+        """Return the distinct optima of rows within Δχ² 20, best first, with the body's shapes, errors and symmetry."""
+        optima = RowOptima.of(found)
+        if body is self._dipoles and (self._has_errors or self.body.has_shapes):
             optima = self._settled(rows, optima)
         if self.symmetry.order > 1:
             position, R, lead = self.symmetry.nearest_to_rest(optima.position_m, optima.R)
@@ -181,7 +183,13 @@ class BodyLocator:
             optima = replace(optima, covariance=self._with_open_axis(rows, optima, body))
         return ranked(optima, self.body.radius_m)
 
-    @property
+    @cached_property
+    def _search_size(self) -> tuple[int, int]:
+        """Number of candidates and of starts of the first search."""
+        wide = self.body.limits.angle_rad > _WIDE_RAD or not self.body.limits.is_bounded
+        return (2 * N_CANDIDATES, 3 * N_STARTS) if wide else (N_CANDIDATES, N_STARTS)
+
+    @cached_property
     def _has_errors(self) -> bool:
         magnets = self.body.magnets
         return bool(self.body.moment_root.size) or any(m.position_sigma_m or m.direction_sigma_rad for m in magnets)
@@ -230,31 +238,25 @@ class BodyLocator:
 
     def _poses(self, rows: WhitenedRows, optima: RowOptima, dof: int) -> BodyPoses:
         """Return the poses of optima within the body's limits, and the reasons of rows without one."""
-        n = len(rows)
-        within = self._within_limits(optima, dof)
-        best_within, best = (
-            np.nanmin(np.where(mask, optima.chi2, np.inf), axis=1, initial=np.inf)
-            for mask in (within, np.isfinite(optima.chi2))
-        )
+        within, known = self._within_limits(optima, dof), np.isfinite(optima.chi2)
+        best_within, best = (np.where(mask, optima.chi2, np.inf).min(axis=1) for mask in (within, known))
         # A pose beyond the limits that alone explains the readings is the truth, and one within them is none.
         left = (best_within > quantile(max(dof, 1), 1.0 - CREDIBLE_FIT)) & (best < best_within - KEEP_WITHIN)
         kept = within & ~left[:, None]
         chosen = optima
-        if (kept != np.isfinite(optima.chi2)).any():
+        if (kept != known).any():
             chosen = ranked(replace(optima, chi2=np.where(kept, optima.chi2, np.nan)), self.body.radius_m)
-        of_rows: tuple[list[tuple[str, ...]], list[str]] = [()] * n, [""] * n
-        poses = BodyPoses(
-            np.arange(n, dtype=np.float64),
-            **vars(chosen),
-            dof=np.full(n, dof, dtype=np.intp),
-            flags=of_rows[0],
-            reason=of_rows[1],
-            symmetry=self.symmetry.words,
-        )
-        for i in np.flatnonzero(~np.isfinite(chosen.chi2[:, 0])).tolist():
+        poses = self._poses_of(chosen, dof)
+        for i in np.flatnonzero(~poses.solved).tolist():
             k = int(np.argmin(np.nan_to_num(optima.chi2[i], nan=np.inf)))
             poses.reason[i] = self._outside(optima.position_m[i, k], optima.R[i, k]) if best[i] < np.inf else _NO_POSE
         return poses
+
+    def _poses_of(self, optima: RowOptima, dof: int) -> BodyPoses:
+        """Return optima as poses without flags."""
+        n, words = len(optima.chi2), self.symmetry.words
+        time_s, all_dof = np.arange(n, dtype=np.float64), np.full(n, dof, dtype=np.intp)
+        return BodyPoses(time_s, **vars(optima), dof=all_dof, flags=[()] * n, reason=[""] * n, symmetry=words)
 
     def _within_limits(self, optima: RowOptima, dof: int) -> BoolArray:
         """Return whether optima (b, W) lie within the limits of the body, or three standard deviations beside them."""
@@ -360,19 +362,6 @@ def _widened(poses: BodyPoses, width: int) -> BodyPoses:
     for name, values in of_places.items():
         wide[name][:, :n] = values[:, :n]
     return replace(poses, **wide)
-
-
-def _enlarged(poses: BodyPoses) -> BodyPoses:
-    """Return poses with flags of doubtful covariances, which are enlarged where χ² is far beyond noise."""
-    limits = {d: quantile(max(d, 1), MISFIT) for d in set(poses.dof.tolist())}
-    is_open = poses.solved & ~np.isfinite(poses.covariance[:, 0]).all(axis=(1, 2))
-    is_misfit = (poses.dof > 0) & (poses.chi2[:, 0] > np.array([limits[d] for d in poses.dof.tolist()]))
-    for i in np.flatnonzero(is_open).tolist():
-        poses.flags[i] = (*poses.flags[i], "unknown")
-    for i in np.flatnonzero(is_misfit).tolist():
-        poses.flags[i] = (*poses.flags[i], "misfit")
-        poses.covariance[i] *= np.maximum(poses.chi2[i] / poses.dof[i], 1.0)[:, None, None]
-    return poses
 
 
 def locate_body(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.bodies.search import KEEP_WITHIN
+from magloc.bodies.search import KEEP_WITHIN, PoseOptima
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +18,11 @@ class RowOptima:
     R: FloatArray
     chi2: FloatArray
     covariance: FloatArray
+
+    @classmethod
+    def of(cls, found: PoseOptima) -> RowOptima:
+        """Return what a search found."""
+        return cls(found.position_m, found.R, found.chi2, found.covariance)
 
     def put(self, rows: IntArray | BoolArray, others: RowOptima) -> None:
         """Write the optima of some rows, of at most as many places."""
