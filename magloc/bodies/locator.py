@@ -69,7 +69,7 @@ class BodyLocator:
     array: SensorArray
     body: MagnetBody
     find_causes: bool = True
-    _tables: dict[tuple[bytes, int, MagnetBody], PoseTable] = field(default_factory=dict)
+    _tables: dict[tuple[bytes, bool, MagnetBody], PoseTable] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.array.common_field_T is None:
@@ -135,26 +135,37 @@ class BodyLocator:
     def _bends(self, rows: WhitenedRows, poses: BodyPoses) -> FloatArray:
         """Return how far readings bend over one standard deviation of the best poses (n,), in units of the noise."""
         magnets, _ = placed_magnets(self.body, poses.position_m[:, 0], poses.R[:, 0])
-        square_m = np.sum((magnets[:, :, None] - self.array.positions) ** 2, axis=-1).min(axis=(1, 2))
+        ways = magnets[:, :, None] - self.array.positions
+        square_m = np.vecdot(ways, ways).min(axis=(1, 2))
         variance = np.diagonal(poses.covariance[:, 0], axis1=1, axis2=2)
         spread = 6.0 * variance[:, :3].sum(axis=1) / square_m + 0.5 * variance[:, 3:].sum(axis=1)
         return np.asarray(spread * np.sqrt(np.vecdot(rows.y, rows.y) / rows.y.shape[1]))
 
-    def _table(self, rows: WhitenedRows, body: MagnetBody, n: int) -> PoseTable:
+    def _table(self, rows: WhitenedRows, body: MagnetBody, again: bool) -> PoseTable:
         """Return the table of candidates for the channels of rows, which is kept."""
-        key = (rows.mask.tobytes(), n, body)
+        key = (rows.mask.tobytes(), again, body)
         if key not in self._tables:
-            self._tables[key] = pose_table(rows.model, self.array, body, n)
+            wide = self.body.limits.angle_rad > _WIDE_RAD or not self.body.limits.is_bounded
+            n_candidates, n_starts = (2 * N_CANDIDATES, 3 * N_STARTS) if wide else (N_CANDIDATES, N_STARTS)
+            if again:
+                n_candidates, n_starts = _MORE_CANDIDATES, _MORE_STARTS
+            exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
+            judged = exact and self.symmetry.order == 1 and self.symmetry.axis is None
+            dof = max(rows.n_differences - self.n_unknowns, 1)
+            self._tables[key] = pose_table(
+                rows.model,
+                self.array,
+                body,
+                n_candidates,
+                n_starts=n_starts,
+                keep_within=KEEP_WITHIN if exact else np.inf,
+                most_chi2=quantile(dof, 1.0 - CREDIBLE_FIT) if judged else -np.inf,
+            )
         return self._tables[key]
 
     def _found(self, rows: WhitenedRows, body: MagnetBody, *, again: bool = False) -> PoseOptima:
         """Return what the kernel finds for rows, with more candidates and starts in a second search."""
-        n_candidates, n_starts = (_MORE_CANDIDATES, _MORE_STARTS) if again else self._search_size
-        exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
-        judged = exact and self.symmetry.order == 1 and self.symmetry.axis is None
-        credible = quantile(max(rows.n_differences - self.n_unknowns, 1), 1.0 - CREDIBLE_FIT) if judged else -np.inf
-        table, keep_within = self._table(rows, body, n_candidates), KEEP_WITHIN if exact else np.inf
-        return search_poses(rows.model, rows.y, table, n_starts=n_starts, keep_within=keep_within, most_chi2=credible)
+        return search_poses(rows.model, rows.y, self._table(rows, body, again))
 
     def _optima(self, rows: WhitenedRows, body: MagnetBody, found: PoseOptima | None = None) -> RowOptima:
         """Return the distinct optima of rows, after a second search for those that no pose fits."""
@@ -182,12 +193,6 @@ class BodyLocator:
         if self.symmetry.axis is not None:
             optima = replace(optima, covariance=self._with_open_axis(rows, optima, body))
         return ranked(optima, self.body.radius_m)
-
-    @cached_property
-    def _search_size(self) -> tuple[int, int]:
-        """Number of candidates and of starts of the first search."""
-        wide = self.body.limits.angle_rad > _WIDE_RAD or not self.body.limits.is_bounded
-        return (2 * N_CANDIDATES, 3 * N_STARTS) if wide else (N_CANDIDATES, N_STARTS)
 
     @cached_property
     def _has_errors(self) -> bool:
@@ -340,6 +345,8 @@ class BodyLocator:
 
 def with_offsets_as_noise(array: SensorArray) -> SensorArray:
     """Return the array with errors of the offsets as noise of a single row."""
+    if not any(sensor.offset_uncertainty_T for sensor in array.sensors):
+        return array
     sensors = tuple(
         replace(sensor, noise_T=math.hypot(sensor.noise_T, sensor.offset_uncertainty_T), offset_uncertainty_T=0.0)
         for sensor in array.sensors

@@ -32,6 +32,7 @@ _APART = 0.15  # least distance of two starts, in radii of the array and radians
 _NEAREST = 0.15  # least distance of a magnet from a sensor in the table, in radii
 _FARTHEST = 6.0  # range of the table for a body without limits, in radii of array and body together
 _ROWS_A_BLOCK = 256
+_TINY = 1e-300  # square of readings that are all zero
 _GOLDEN = 1.1127756842787055  # root of x^7 = x + 1: a lattice of six dimensions
 
 
@@ -41,7 +42,7 @@ class PoseOptima(NamedTuple):
     Positions (n, W, 3), rotation matrices (n, W, 3, 3), χ² (n, W), covariances (n, W, 6, 6) of (δx, δθ) with δθ in the
     body's frame, and counts (n, 3): optima, starts that did not converge, linearisations. The bend (n,) is that of the
     readings over one standard deviation of the best pose, in units of the noise. Plain rows (n,) have a best χ² below
-    the one that :func:`search_poses` is given, and all their optima are apart and within the limits of the body.
+    that of :func:`pose_table`, and all their optima are apart and within the limits of the body.
     """
 
     position_m: FloatArray
@@ -90,7 +91,7 @@ def features_of(y: FloatArray) -> NDArray[np.float32]:
     The field falls with the third power of the distance, so the length of a reading is replaced by its cubic root.
     """
     features = np.ones((len(y), y.shape[1] + 1), dtype=np.float32)
-    features[:, :-1] = y / np.cbrt(np.maximum(np.vecdot(y, y), np.finfo(np.float64).tiny))[:, None]
+    features[:, :-1] = y / np.cbrt(np.vecdot(y, y) + _TINY)[:, None]
     return features
 
 
@@ -114,8 +115,20 @@ class PoseTable:
     search: core.Problem
 
 
-def pose_table(model: WhitenedModel, array: SensorArray, body: MagnetBody, n: int = N_CANDIDATES) -> PoseTable:
-    """Return the table of candidates for rows that share a whitening; only the first row of the model counts."""
+def pose_table(
+    model: WhitenedModel,
+    array: SensorArray,
+    body: MagnetBody,
+    n: int = N_CANDIDATES,
+    *,
+    n_starts: int = N_STARTS,
+    keep_within: float = KEEP_WITHIN,
+    most_chi2: float = -math.inf,
+) -> PoseTable:
+    """Return the table of candidates for rows that share a whitening, and how they are searched.
+
+    Only the first row of the model counts. The χ² is that of plain rows at most.
+    """
     position, R = spread_poses(body, array, n)
     usable = _is_clear(body, array, position, R)
     position, R = position[usable], R[usable]
@@ -130,16 +143,16 @@ def pose_table(model: WhitenedModel, array: SensorArray, body: MagnetBody, n: in
         fit=fit,
         n_candidates=len(candidates),
         n_features=len(table),
-        n_starts=N_STARTS,
+        n_starts=n_starts,
         n_kept=N_KEPT,
-        keep_within=KEEP_WITHIN,
+        keep_within=keep_within,
         apart=_APART,
         candidates=candidates,
         table=table,
         low=tuple((limits.low_m - model.centroid) / model.radius),
         high=tuple((limits.high_m - model.centroid) / model.radius),
         least_trace=1.0 + 2.0 * math.cos(limits.angle_rad),
-        most_chi2=-math.inf,
+        most_chi2=most_chi2,
         **dict.fromkeys(of_rows),
     )
     return PoseTable(candidates, table, fit, search)
@@ -218,15 +231,7 @@ def refine_dipoles(
     return fits, covariance
 
 
-def search_poses(
-    model: WhitenedModel,
-    y: FloatArray,
-    table: PoseTable,
-    *,
-    n_starts: int = N_STARTS,
-    keep_within: float = KEEP_WITHIN,
-    most_chi2: float = -math.inf,
-) -> PoseOptima:
+def search_poses(model: WhitenedModel, y: FloatArray, table: PoseTable) -> PoseOptima:
     """Return the distinct optima of whitened rows (n, C) of the table's body of dipoles."""
     n = len(y)
     pose, chi2 = np.empty((n, N_KEPT, 12)), np.empty((n, N_KEPT))
@@ -234,9 +239,6 @@ def search_poses(
     bend, is_plain = np.empty(n), np.empty(n, np.bool_)
     work = table.search.with_fields(
         fit=table.fit.with_fields(channels=model.channels, signals=signals_of_rows(model, y), row=np.arange(n)),
-        n_starts=n_starts,
-        keep_within=keep_within,
-        most_chi2=most_chi2,
         features=features_of(y - model.ambient_signals if model.sees_moduli else y),
         bend=bend,
         is_plain=is_plain.view(np.uint8),
