@@ -18,7 +18,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import placed_magnets
 from magloc.bodies.fit import linearise, refine_poses
-from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_places
+from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_places, without_gaps
 from magloc.bodies.poses import BodyPoses, enlarged, with_bends
 from magloc.bodies.search import (
     KEEP_WITHIN,
@@ -250,7 +250,7 @@ class BodyLocator:
         kept = within & ~left[:, None]
         chosen = optima
         if (kept != known).any():
-            chosen = ranked(replace(optima, chi2=np.where(kept, optima.chi2, np.nan)), self.body.radius_m)
+            chosen = without_gaps(replace(optima, chi2=np.where(kept, optima.chi2, np.nan)))
         poses = self._poses_of(chosen, dof)
         for i in np.flatnonzero(~poses.solved).tolist():
             k = int(np.argmin(np.nan_to_num(optima.chi2[i], nan=np.inf)))

@@ -67,7 +67,12 @@ def _ranked(optima: RowOptima, length_m: float) -> RowOptima:
         way, turn = position[:, :k] - position[:, k : k + 1], R[:, :k] - R[:, k : k + 1]
         apart = np.sqrt(np.vecdot(way, way)) / length_m + np.sqrt(np.vecdot(turn, turn))
         chi2[((apart < 1e-3) & np.isfinite(chi2[:, :k])).any(axis=1), k] = np.nan
-    most = max(int(np.isfinite(chi2).sum(axis=1).max(initial=0)), 1)
+    return without_gaps(optima)
+
+
+def without_gaps(optima: RowOptima) -> RowOptima:
+    """Return optima in order of χ² in as few places as they need, NaN in the others."""
+    most = max(int(np.isfinite(optima.chi2).sum(axis=1).max(initial=0)), 1)
     result = RowOptima(*(values[:, :most] for values in vars(_in_order(optima)).values()))
     gone = ~np.isfinite(result.chi2)
     for values in vars(result).values():

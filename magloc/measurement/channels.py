@@ -65,7 +65,9 @@ def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, modu
 def signals_of(model: WhitenedModel, y: FloatArray) -> FloatArray:
     """Return whitened readings (b, C), followed by those of known parts of the common field."""
     if len(model) and model.shares_whitening:
-        return np.ascontiguousarray(y) if model.signal_matrix is None else y @ model.signal_matrix
+        if model.signal_matrix is None:
+            return np.ascontiguousarray(y)
+        return np.asarray((y[:, None] @ model.signal_matrix)[:, 0])  # one by one: the same for a row in any batch
     known = _known_columns(model)
     if not known.size:
         return np.ascontiguousarray(y)
