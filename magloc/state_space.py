@@ -197,25 +197,28 @@ def iterated_update(
     return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
 
 
+# Series of 2x - 3 + 4 exp(-x) - exp(-2x) over x³, from the highest power down; up to x = 1 the rest is below rounding.
+_VARIANCE_OF_VALUE = tuple((4.0 - 2.0**k) * (-1.0) ** k / math.factorial(k) for k in range(22, 2, -1))
+
+
 def ornstein_uhlenbeck_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
     """Return F[0, 1] and F[1, 1] of (value, rate), and the root (2, 2) of its noise for σ = 1."""
-    if dt_s == 0.0:
-        return 0.0, 1.0, np.zeros((2, 2))
-    if dt_s > correlation_s:
-        # Van Loan's exponential grows with exp(Δt/τ) and loses Q over long gaps; the closed form cancels in short ones.
-        decay = math.exp(-dt_s / correlation_s)
-        Q_vv, Q_pv = 1.0 - decay**2, correlation_s * (1.0 - decay) ** 2
-        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * decay - decay**2)
-        root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
-        return correlation_s * (1.0 - decay), decay, root
-    from filterpy.common import van_loan_discretization  # it brings matplotlib and scipy.stats
-
-    drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
-    F, Q = van_loan_discretization(drift, np.array([[0.0], [1.0]]), dt_s)
-    # The value's own noise grows with Δt³: the factorisation must not see it cancel.
-    scale = np.sqrt(np.diagonal(Q))
-    root = math.sqrt(2.0 / correlation_s) * scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
-    return float(F[0, 1]), float(F[1, 1]), root
+    x = dt_s / correlation_s
+    if x < 1e-100:
+        return dt_s, 1.0, np.zeros((2, 2))
+    lost, Q_vv = -math.expm1(-x), -math.expm1(-2.0 * x)
+    if x > 1.0:
+        Q_pp = 2.0 * x - 3.0 + 4.0 * math.exp(-x) - math.exp(-2.0 * x)
+    else:  # the closed form cancels in short steps, its series does not
+        Q_pp = 0.0
+        for term in _VARIANCE_OF_VALUE:
+            Q_pp = Q_pp * x + term
+        Q_pp *= x**3
+    root_pp = math.sqrt(Q_pp)
+    root_pv = lost * lost / root_pp
+    root_vv = math.sqrt(Q_vv - root_pv * root_pv)
+    root = np.array([[correlation_s * root_pp, 0.0], [root_pv, root_vv]])
+    return correlation_s * lost, math.exp(-x), root
 
 
 def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[FloatArray, FloatArray]:

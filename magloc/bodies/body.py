@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -233,7 +233,15 @@ class MagnetBody:
         """Largest distance of a magnet from the mean position [m]."""
         return float(np.linalg.norm(self.positions_m - self.centre_m, axis=1).max())
 
-    @property
+    def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
+        """Hash of all fields, cached because every fix needs it."""
+        return hash(tuple(getattr(self, field.name) for field in fields(self)))
+
+    @cached_property
     def has_shapes(self) -> bool:
         """True if some magnet is not a dipole."""
         return any(magnet.shape is not None for magnet in self.magnets)

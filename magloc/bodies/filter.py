@@ -21,7 +21,7 @@ from magloc.bodies.body import MagnetBody
 from magloc.bodies.locator import BodyLocator
 from magloc.bodies.plausibility import warn_of_no_check
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
-from magloc.bodies.search import fit_problem, packed, unpacked
+from magloc.bodies.search import fit_problem, packed, signals_of_rows, unpacked
 from magloc.bodies.track import BodyMotion, BodyTrack, TrackRows, joined_rows, judged, nearest_poses, placement_effects
 from magloc.chi_square import quantile
 from magloc.levels import CONTRADICTION
@@ -65,6 +65,7 @@ class BodyTracker:
         self._recent = np.zeros((0, 2))
         self._located_pose, self._located_step = (np.full(3, np.nan), np.eye(3)), math.nan
         self._state: _State | None = None
+        self._problems: tuple[core.Problem, core.Problem] | None = None
         self._lasting: tuple[FloatArray, FloatArray] | None = None  # of the errors: mean, covariance
 
     @property
@@ -86,9 +87,7 @@ class BodyTracker:
         problem = _TrackProblem(self, rows, track.time_s, self._last_s)
         row = 0
         while row < n:
-            before = self._last_s if row == 0 else float(track.time_s[row - 1])
-            gap = None if before is None else float(track.time_s[row]) - before
-            if self._state is None or gap is None or self.motion.is_lost(gap, rows.model.radius):
+            if self._state is None or (self._last_s is None and row == 0) or problem.is_lost[row]:
                 started = self._start(problem, values, ambient_T, row, track)
                 if not started:
                     row += 1
@@ -141,6 +140,27 @@ class BodyTracker:
             packed(model, position_m, R), np.zeros(_RATES), errors.copy(), P, np.array([0, 1], np.int64), True
         )
 
+    def kernel_problems(self, model: WhitenedModel) -> tuple[core.Problem, core.Problem]:
+        """Return the fit and the filter for the kernel, without rows."""
+        if self._problems is None:
+            of_rows = ("sensor_errors", "lasting", "added", "steps", "nis_limits", "curvature")
+            of_state = ("pose", "rates", "errors", "covariance", "progress")
+            results = ("poses", "all_rates", "covariances", "nis", "status")
+            fit = fit_problem(model, self.body, None, None, _MAX_ITERATIONS)
+            track = core.problem(
+                "pose_track",
+                fit=fit,
+                n_magnet_errors=self.body.moment_root.shape[1],
+                n_sensor_errors=self._errors.n_states + self._n_placement,
+                max_iterations=_MAX_ITERATIONS,
+                most_contradictions=MOST_CONTRADICTIONS,
+                tolerance=_TOLERANCE,
+                magnet_errors=np.ascontiguousarray(self.body.moment_root),
+                **dict.fromkeys(of_rows + of_state + results),
+            )
+            self._problems = fit, track
+        return self._problems
+
     def _keep_errors(self) -> None:
         """Keep what a track has learnt of lasting errors for the next one."""
         if self._state is not None and self._state.errors.size:
@@ -192,6 +212,10 @@ class BodyTracker:
             of_rows = np.array([self._errors.effect(self.array, row) for row in group.readings_T])
         else:
             of_rows = self._errors.effect(self.array, group.readings_T)  # (b, C, a)
+        if group.model.shares_whitening:
+            effects = of_rows.transpose(0, 2, 1)
+            flat = whitening.of_unit_noise(effects.reshape(-1, effects.shape[2]))
+            return group.model.whiten(flat).reshape(effects.shape)
         unit = np.stack([whitening.of_unit_noise(of_rows[..., e]) for e in range(a)], axis=-1)
         return np.ascontiguousarray(group.model.whiten(unit).transpose(0, 2, 1))
 
@@ -221,15 +245,14 @@ class _TrackProblem:
         n, radius = len(time_s), rows.model.radius
         before = np.concatenate([[time_s[0] if last_s is None else last_s] if n else [], time_s[:-1]])
         self.dt_s = time_s - before
-        of_steps = {dt: tracker.motion.step(dt, radius) for dt in set(self.dt_s.tolist())}
-        self.steps = np.array([of_steps[dt] for dt in self.dt_s.tolist()]).reshape(n, 10)
-        kept_added = {dt: tracker.error_step(dt) for dt in set(self.dt_s.tolist())}
-        self.lasting, self.added = (
-            np.array([kept_added[dt][part] for dt in self.dt_s.tolist()]).reshape(n, -1) for part in (0, 1)
-        )
-        limits = {int(d): quantile(int(d), CONTRADICTION) for d in np.unique(rows.n_differences)}
-        self.limits = np.array([limits[int(d)] for d in rows.n_differences])
-        self._signals = signals_of(rows.model, rows.y)
+        self.is_lost = tracker.motion.is_lost(self.dt_s, radius)
+        steps = self.dt_s.tolist()
+        of_steps = {dt: tracker.motion.step(dt, radius) for dt in set(steps)}
+        self.steps = np.array([of_steps[dt] for dt in steps]).reshape(n, 10)
+        kept_added = {dt: tracker.error_step(dt) for dt in set(steps)}
+        self.lasting, self.added = (np.array([kept_added[dt][part] for dt in steps]).reshape(n, -1) for part in (0, 1))
+        self.limits = np.array([quantile(d, CONTRADICTION) for d in rows.n_differences.tolist()])
+        self._signals = signals_of_rows(rows.model, rows.y)
         a = rows.effects.shape[1]
         index = np.repeat(np.arange(n), a)
         flat = signals_of(rows.model.rows(index), rows.effects.reshape(n * a, rows.effects.shape[2])) if a else None
@@ -237,11 +260,8 @@ class _TrackProblem:
 
     def until_gap(self, row: int) -> int:
         """Return the first row after a row that a track does not reach over a gap."""
-        radius = self.rows.model.radius
-        for later in range(row + 1, len(self.dt_s)):
-            if self.tracker.motion.is_lost(float(self.dt_s[later]), radius):
-                return later
-        return len(self.dt_s)
+        later = np.flatnonzero(self.is_lost[row + 1 :])
+        return row + 1 + int(later[0]) if later.size else len(self.is_lost)
 
     def cost(self, state: _State, row: int) -> float:
         """Return the NIS of a state over the next rows, with a penalty for contradictions."""
@@ -292,25 +312,18 @@ class _TrackProblem:
         if state.is_new:  # it begins at its row
             steps[0] = [0.0, 1.0, 0.0, 0.0, 0.0] * 2
             lasting[0], added[0], curvature[0] = 1.0, 0.0, 1.0 / _WIDENED
-        body = self.tracker.body
         if not self.tracker.is_compiled:
             return self._follow_shapes(
                 state, row, (steps, lasting, added), curvature, (poses, rates, covariances, nis, status)
             )
-        work = core.problem(
-            "pose_track",
-            fit=fit_problem(self.rows.model, self._signals, body, np.arange(row, end), _MAX_ITERATIONS),
-            n_magnet_errors=body.moment_root.shape[1],
-            n_sensor_errors=self.rows.effects.shape[1],
-            max_iterations=_MAX_ITERATIONS,
-            most_contradictions=MOST_CONTRADICTIONS,
-            tolerance=_TOLERANCE,
-            magnet_errors=np.ascontiguousarray(body.moment_root),
+        fit, work = self.tracker.kernel_problems(self.rows.model)
+        work = work.with_fields(
+            fit=fit.with_fields(channels=self.rows.model.channels, signals=self._signals, row=np.arange(row, end)),
             sensor_errors=None if self._effects is None else self._effects[row:end],
-            lasting=np.ascontiguousarray(lasting),
-            added=np.ascontiguousarray(added),
+            lasting=lasting,
+            added=added,
             steps=steps,
-            nis_limits=np.ascontiguousarray(self.limits[row:end]),
+            nis_limits=self.limits[row:end],
             curvature=curvature,
             pose=state.pose,
             rates=state.rates,

@@ -17,13 +17,22 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.field import placed_magnets
 from magloc.bodies.fit import linearise, refine_poses
-from magloc.bodies.optima import RowOptima, inverses, ranked, turned_covariances, with_alternatives, with_places
+from magloc.bodies.optima import (
+    RowOptima,
+    inverses,
+    ranked,
+    turned_covariances,
+    with_alternatives,
+    with_places,
+    without_gaps,
+)
 from magloc.bodies.plausibility import check_lengths, warn_of_inside, warn_of_no_check
-from magloc.bodies.poses import BodyPoses
+from magloc.bodies.poses import BodyPoses, enlarged, with_bends
 from magloc.bodies.search import (
     KEEP_WITHIN,
     N_CANDIDATES,
     N_STARTS,
+    PoseOptima,
     PoseTable,
     pose_table,
     refine_dipoles,
@@ -44,7 +53,6 @@ _ROWS_AT_ONCE = 2048
 _LIMIT_SIGMAS = 3.0
 _OPEN_SIGMA_RAD = np.pi / np.sqrt(3.0)  # of an angle that may be anything
 _ABSENT = 1e-9
-_LARGEST_BEND = 0.3  # beyond it the mean NEES of simulated rows is 2
 _ROUNDS, _UNSETTLED = 5, 3.0
 _NO_POSE = "no start leads to a pose that fits"
 
@@ -70,7 +78,7 @@ class BodyLocator:
     array: SensorArray
     body: MagnetBody
     find_causes: bool = True
-    _tables: dict[tuple[bytes, int, MagnetBody], PoseTable] = field(default_factory=dict)
+    _tables: dict[tuple[bytes, bool, MagnetBody], PoseTable] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.array.common_field_T is None:
@@ -118,52 +126,65 @@ class BodyLocator:
         dof = rows.n_differences - self.n_unknowns
         if dof < 0:
             poses = BodyPoses.none(n, 1, self.symmetry.words)
-            reason = (
-                f"{int(rows.mask.sum())} readings give {rows.n_differences} independent differences,"
-                f" {self.n_unknowns} are needed"
-            )
-            return replace(poses, reason=[reason] * n)
-        optima = self._optima(rows, self._dipoles)
-        poses = self._poses(rows, optima, dof)
-        detected = is_detected(rows.energy, rows.n_differences)
-        for i in np.flatnonzero(rows.is_silent | ~detected).tolist():
+            given = f"{int(rows.mask.sum())} readings give {rows.n_differences} independent differences"
+            return replace(poses, reason=[f"{given}, {self.n_unknowns} are needed"] * n)
+        found = self._found(rows, self._dipoles)
+        absent = rows.is_silent | ~is_detected(rows.energy, rows.n_differences)
+        if found.is_plain.all() and not absent.any():
+            return with_bends(self._poses_of(RowOptima.of(found), dof), found.bend)
+        poses = self._poses(rows, self._optima(rows, self._dipoles, found), dof)
+        for i in np.flatnonzero(absent).tolist():
             poses.reason[i] = NO_SIGNAL if rows.is_silent[i] else "nothing stands out of the noise"
             for values in (poses.position_m, poses.R, poses.chi2, poses.covariance):
                 values[i] = np.nan
         if self.find_causes and dof > 0:
             self._name_causes(rows, poses, ambient_T)
-        poses = _enlarged(poses)
-        for i in np.flatnonzero(self._bends(rows, poses) > _LARGEST_BEND).tolist():
-            poses.flags[i] = (*poses.flags[i], "bent")
-        return poses
+        return with_bends(enlarged(poses), self._bends(rows, poses))
 
     def _bends(self, rows: WhitenedRows, poses: BodyPoses) -> FloatArray:
         """Return the nonlinearity of readings (n,) over one σ of the best poses, in units of the noise."""
         magnets, _ = placed_magnets(self.body, poses.position_m[:, 0], poses.R[:, 0])
-        square_m = np.sum((magnets[:, :, None] - self.array.positions) ** 2, axis=-1).min(axis=(1, 2))
+        ways = magnets[:, :, None] - self.array.positions
+        square_m = np.vecdot(ways, ways).min(axis=(1, 2))
         variance = np.diagonal(poses.covariance[:, 0], axis1=1, axis2=2)
         spread = 6.0 * variance[:, :3].sum(axis=1) / square_m + 0.5 * variance[:, 3:].sum(axis=1)
         return np.asarray(spread * np.sqrt(np.vecdot(rows.y, rows.y) / rows.y.shape[1]))
 
-    def _table(self, rows: WhitenedRows, body: MagnetBody, n: int) -> PoseTable:
+    def _table(self, rows: WhitenedRows, body: MagnetBody, again: bool) -> PoseTable:
         """Return the table of candidates for the channels of rows, which is kept."""
-        key = (rows.mask.tobytes(), n, body)
+        key = (rows.mask.tobytes(), again, body)
         if key not in self._tables:
-            self._tables[key] = pose_table(rows.model, self.array, body, n)
+            n_candidates, n_starts = (2 * N_CANDIDATES, 3 * N_STARTS) if self._is_wide else (N_CANDIDATES, N_STARTS)
+            if again:
+                n_candidates, n_starts = _MORE_CANDIDATES, _MORE_STARTS
+            if has_twins := self._has_twins(rows):
+                n_candidates, n_starts = _MORE_CANDIDATES, (4 if again else 2) * _MORE_STARTS
+            exact = body is self._dipoles and not (self._has_errors or self.body.has_shapes or has_twins)
+            judged = exact and self.symmetry.order == 1 and self.symmetry.axis is None
+            dof = max(rows.n_differences - self.n_unknowns, 1)
+            self._tables[key] = pose_table(
+                rows.model,
+                self.array,
+                body,
+                n_candidates,
+                n_starts=n_starts,
+                keep_within=KEEP_WITHIN if exact else np.inf,
+                most_chi2=quantile(dof, 1.0 - CREDIBLE_FIT) if judged else -np.inf,
+            )
         return self._tables[key]
 
-    def _optima(self, rows: WhitenedRows, body: MagnetBody) -> RowOptima:
+    def _found(self, rows: WhitenedRows, body: MagnetBody, *, again: bool = False) -> PoseOptima:
+        """Return what the kernel finds for rows, with more candidates and starts in a second search."""
+        return search_poses(rows.model, rows.y, self._table(rows, body, again))
+
+    def _optima(self, rows: WhitenedRows, body: MagnetBody, found: PoseOptima | None = None) -> RowOptima:
         """Return the distinct optima of rows, after a second search for those that no pose fits."""
-        n_candidates, n_starts = (2 * N_CANDIDATES, 3 * N_STARTS) if self._is_wide else (N_CANDIDATES, N_STARTS)
-        more_starts = _MORE_STARTS
-        if self._has_twins(rows):
-            n_candidates, n_starts, more_starts = _MORE_CANDIDATES, 2 * _MORE_STARTS, 4 * _MORE_STARTS
-        optima = self._search(rows, body, n_candidates, n_starts)
+        optima = self._settled_optima(rows, body, found or self._found(rows, body))
         dof = max(rows.n_differences - self.n_unknowns, 1)
         doubtful = ~(optima.chi2[:, 0] < quantile(dof, 1.0 - CREDIBLE_FIT))
         if doubtful.any():
             some = rows.select(doubtful)
-            again = self._search(some, body, _MORE_CANDIDATES, more_starts)
+            again = self._settled_optima(some, body, self._found(some, body, again=True))
             before = np.nan_to_num(optima.chi2[doubtful, 0], nan=np.inf)
             better = np.nan_to_num(again.chi2[:, 0], nan=np.inf) < before
             width = max(again.chi2.shape[1], optima.chi2.shape[1])
@@ -171,17 +192,12 @@ class BodyLocator:
             optima.put(np.flatnonzero(doubtful)[better], RowOptima(*(v[better] for v in vars(again).values())))
         return optima
 
-    def _search(self, rows: WhitenedRows, body: MagnetBody, n_candidates: int, n_starts: int) -> RowOptima:
-        """Return the distinct optima of rows within Δχ² 20 and within the body's limits, best first."""
-        exact = body is self._dipoles and not self._has_errors and not self.body.has_shapes
-        has_twins = self._has_twins(rows)
-        table = self._table(rows, body, n_candidates)
-        keep_within = KEEP_WITHIN if exact and not has_twins else np.inf
-        found = search_poses(rows.model, rows.y, body, table, n_starts=n_starts, keep_within=keep_within)
-        optima = RowOptima(found.position_m, found.R, found.chi2, found.covariance)
-        if has_twins:
+    def _settled_optima(self, rows: WhitenedRows, body: MagnetBody, found: PoseOptima) -> RowOptima:
+        """Return the distinct optima of rows within Δχ² 20, best first, with the body's shapes, errors and symmetry."""
+        optima = RowOptima.of(found)
+        if self._has_twins(rows):
             optima = with_alternatives(rows, body, optima)
-        if body is self._dipoles and not exact:
+        if body is self._dipoles and (self._has_errors or self.body.has_shapes):
             optima = self._settled(rows, optima)
         if self.symmetry.order > 1:
             position, R, lead = self.symmetry.nearest_to_rest(optima.position_m, optima.R)
@@ -253,31 +269,25 @@ class BodyLocator:
 
     def _poses(self, rows: WhitenedRows, optima: RowOptima, dof: int) -> BodyPoses:
         """Return the poses of optima within the body's limits, and the reasons of rows without one."""
-        n = len(rows)
-        within = self._within_limits(optima, dof)
-        best_within, best = (
-            np.nanmin(np.where(mask, optima.chi2, np.inf), axis=1, initial=np.inf)
-            for mask in (within, np.isfinite(optima.chi2))
-        )
+        within, known = self._within_limits(optima, dof), np.isfinite(optima.chi2)
+        best_within, best = (np.where(mask, optima.chi2, np.inf).min(axis=1) for mask in (within, known))
         # A pose beyond the limits that alone explains the readings is the truth, and one within them is none.
         left = (best_within > quantile(max(dof, 1), 1.0 - CREDIBLE_FIT)) & (best < best_within - KEEP_WITHIN)
         kept = within & ~left[:, None]
         chosen = optima
-        if (kept != np.isfinite(optima.chi2)).any():
-            chosen = ranked(replace(optima, chi2=np.where(kept, optima.chi2, np.nan)), self.body.radius_m)
-        of_rows: tuple[list[tuple[str, ...]], list[str]] = [()] * n, [""] * n
-        poses = BodyPoses(
-            np.arange(n, dtype=np.float64),
-            **vars(chosen),
-            dof=np.full(n, dof, dtype=np.intp),
-            flags=of_rows[0],
-            reason=of_rows[1],
-            symmetry=self.symmetry.words,
-        )
-        for i in np.flatnonzero(~np.isfinite(chosen.chi2[:, 0])).tolist():
+        if (kept != known).any():
+            chosen = without_gaps(replace(optima, chi2=np.where(kept, optima.chi2, np.nan)))
+        poses = self._poses_of(chosen, dof)
+        for i in np.flatnonzero(~poses.solved).tolist():
             k = int(np.argmin(np.nan_to_num(optima.chi2[i], nan=np.inf)))
             poses.reason[i] = self._outside(optima.position_m[i, k], optima.R[i, k]) if best[i] < np.inf else _NO_POSE
         return poses
+
+    def _poses_of(self, optima: RowOptima, dof: int) -> BodyPoses:
+        """Return optima as poses without flags."""
+        n, words = len(optima.chi2), self.symmetry.words
+        time_s, all_dof = np.arange(n, dtype=np.float64), np.full(n, dof, dtype=np.intp)
+        return BodyPoses(time_s, **vars(optima), dof=all_dof, flags=[()] * n, reason=[""] * n, symmetry=words)
 
     def _within_limits(self, optima: RowOptima, dof: int) -> BoolArray:
         """Return whether optima (b, W) lie in the limits of the body, or at most three standard deviations outside."""
@@ -361,6 +371,8 @@ class BodyLocator:
 
 def with_offsets_as_noise(array: SensorArray) -> SensorArray:
     """Return the array with errors of the offsets as noise of a single row."""
+    if not any(sensor.offset_uncertainty_T for sensor in array.sensors):
+        return array
     sensors = tuple(
         replace(sensor, noise_T=math.hypot(sensor.noise_T, sensor.offset_uncertainty_T), offset_uncertainty_T=0.0)
         for sensor in array.sensors
@@ -383,19 +395,6 @@ def _widened(poses: BodyPoses, width: int) -> BodyPoses:
     for name, values in of_places.items():
         wide[name][:, :n] = values[:, :n]
     return replace(poses, **wide)
-
-
-def _enlarged(poses: BodyPoses) -> BodyPoses:
-    """Return poses with flags of doubtful covariances, which are enlarged where χ² is far beyond noise."""
-    limits = {d: quantile(max(d, 1), MISFIT) for d in set(poses.dof.tolist())}
-    is_open = poses.solved & ~np.isfinite(poses.covariance[:, 0]).all(axis=(1, 2))
-    is_misfit = (poses.dof > 0) & (poses.chi2[:, 0] > np.array([limits[d] for d in poses.dof.tolist()]))
-    for i in np.flatnonzero(is_open).tolist():
-        poses.flags[i] = (*poses.flags[i], "unknown")
-    for i in np.flatnonzero(is_misfit).tolist():
-        poses.flags[i] = (*poses.flags[i], "misfit")
-        poses.covariance[i] *= np.maximum(poses.chi2[i] / poses.dof[i], 1.0)[:, None, None]
-    return poses
 
 
 def locate_body(

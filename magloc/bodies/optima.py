@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
-from magloc.bodies.search import KEEP_WITHIN, N_KEPT, refine_dipoles
+from magloc.bodies.search import KEEP_WITHIN, N_KEPT, PoseOptima, refine_dipoles
 from magloc.measurement.rows import WhitenedRows
 from magloc.navigation.rotations import rotation_matrix
 
@@ -28,6 +28,11 @@ class RowOptima:
     R: FloatArray
     chi2: FloatArray
     covariance: FloatArray
+
+    @classmethod
+    def of(cls, found: PoseOptima) -> RowOptima:
+        """Return what a search found."""
+        return cls(found.position_m, found.R, found.chi2, found.covariance)
 
     def put(self, rows: IntArray | BoolArray, others: RowOptima) -> None:
         """Write the optima of some rows; they have at most as many places as these."""
@@ -65,32 +70,30 @@ def ranked(optima: RowOptima, length_m: float) -> RowOptima:
 
 def _ranked(optima: RowOptima, length_m: float) -> RowOptima:
     """Return :func:`ranked` of rows with several optima."""
-    chi2 = np.where(np.isfinite(optima.chi2), optima.chi2, np.inf)
-    order = np.argsort(chi2, axis=1, kind="stable")
-    chi2 = np.take_along_axis(chi2, order, axis=1)
-    position = np.take_along_axis(optima.position_m, order[..., None], axis=1)
-    R = np.take_along_axis(optima.R, order[..., None, None], axis=1)
-    covariance = np.take_along_axis(optima.covariance, order[..., None, None], axis=1)
-    chi2[chi2 > chi2[:, :1] + KEEP_WITHIN] = np.inf
+    optima = _in_order(optima)
+    position, R, chi2 = optima.position_m, optima.R.reshape(*optima.chi2.shape, 9), optima.chi2
+    chi2[~(chi2 <= chi2[:, :1] + KEEP_WITHIN)] = np.nan
     for k in range(1, chi2.shape[1]):
-        way = np.linalg.norm(position[:, :k] - position[:, k : k + 1], axis=-1) / length_m
-        turn = np.linalg.norm(R[:, :k] - R[:, k : k + 1], axis=(-2, -1))
-        same = (way + turn < 1e-3) & np.isfinite(chi2[:, :k])
-        chi2[same.any(axis=1), k] = np.inf
-    again = np.argsort(chi2, axis=1, kind="stable")
-    most = max(int(np.isfinite(chi2).sum(axis=1).max(initial=0)), 1)
-    again = again[:, :most]
-    chi2 = np.take_along_axis(chi2, again, axis=1)
-    gone = ~np.isfinite(chi2)
-    result = RowOptima(
-        np.take_along_axis(position, again[..., None], axis=1),
-        np.take_along_axis(R, again[..., None, None], axis=1),
-        np.where(gone, np.nan, chi2),
-        np.take_along_axis(covariance, again[..., None, None], axis=1),
-    )
+        way, turn = position[:, :k] - position[:, k : k + 1], R[:, :k] - R[:, k : k + 1]
+        apart = np.sqrt(np.vecdot(way, way)) / length_m + np.sqrt(np.vecdot(turn, turn))
+        chi2[((apart < 1e-3) & np.isfinite(chi2[:, :k])).any(axis=1), k] = np.nan
+    return without_gaps(optima)
+
+
+def without_gaps(optima: RowOptima) -> RowOptima:
+    """Return optima in order of χ² in as few places as they need, NaN in the others."""
+    most = max(int(np.isfinite(optima.chi2).sum(axis=1).max(initial=0)), 1)
+    result = RowOptima(*(values[:, :most] for values in vars(_in_order(optima)).values()))
+    gone = ~np.isfinite(result.chi2)
     for values in vars(result).values():
         values[gone] = np.nan
     return result
+
+
+def _in_order(optima: RowOptima) -> RowOptima:
+    """Return a copy of optima in order of χ², those without one last."""
+    order, row = np.argsort(optima.chi2, axis=1, kind="stable"), np.arange(len(optima.chi2))[:, None]
+    return RowOptima(*(values[row, order] for values in vars(optima).values()))
 
 
 def turned_covariances(covariance: FloatArray, lead: FloatArray) -> FloatArray:

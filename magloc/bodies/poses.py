@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from arrays.io.csv import Column
 from arrays.io.results import Result
 from arrays.typing import FloatArray, IntArray
+from magloc.chi_square import exceeds
+from magloc.levels import MISFIT
 
 FLAGS = {
     "missing": "this magnet gives no field: the readings agree with the body without it",
@@ -21,6 +23,9 @@ FLAGS = {
     "unknown": "the readings leave a rotation or a translation open",
 }
 """Flags of a pose, and what they mean."""
+
+
+_LARGEST_BEND = 0.3  # beyond it the mean NEES of simulated rows is 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,3 +180,22 @@ class BodyPoses(Result):
             "chi2": float(self.chi2[i, k]),
             "dof": int(self.dof[i]),
         }
+
+
+def with_bends(poses: BodyPoses, bend: FloatArray) -> BodyPoses:
+    """Return poses with flags of those over whose standard deviation the readings bend too far (n,)."""
+    for i in np.flatnonzero(bend > _LARGEST_BEND).tolist():
+        poses.flags[i] = (*poses.flags[i], "bent")
+    return poses
+
+
+def enlarged(poses: BodyPoses) -> BodyPoses:
+    """Return poses with flags of doubtful covariances, which are enlarged where χ² is far beyond noise."""
+    is_open = poses.solved & ~np.isfinite(poses.covariance[:, 0]).all(axis=(1, 2))
+    is_misfit = exceeds(poses.chi2[:, 0], poses.dof, MISFIT)
+    for i in np.flatnonzero(is_open).tolist():
+        poses.flags[i] = (*poses.flags[i], "unknown")
+    for i in np.flatnonzero(is_misfit).tolist():
+        poses.flags[i] = (*poses.flags[i], "misfit")
+        poses.covariance[i] *= np.maximum(poses.chi2[i] / poses.dof[i], 1.0)[:, None, None]
+    return poses

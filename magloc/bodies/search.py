@@ -32,6 +32,7 @@ _APART = 0.15  # least distance of two starts, in radii of the array and radians
 _NEAREST = 0.15  # least distance of a magnet from a sensor in the table, in radii
 _FARTHEST = 6.0  # range of the table for a body without limits, in radii of array and body together
 _ROWS_A_BLOCK = 256
+_TINY = 1e-300  # square of readings that are all zero
 _GOLDEN = 1.1127756842787055  # root of x^7 = x + 1: a lattice of six dimensions
 
 
@@ -39,7 +40,9 @@ class PoseOptima(NamedTuple):
     """Distinct optima of n rows, best first, W places a row; NaN where there is none.
 
     Positions (n, W, 3), rotation matrices (n, W, 3, 3), χ² (n, W), covariances (n, W, 6, 6) of (δx, δθ) with δθ in the
-    body's frame, and counts (n, 3): optima, starts that did not converge, linearisations.
+    body's frame, and counts (n, 3): optima, starts that did not converge, linearisations. The bend (n,) is that of the
+    readings over one standard deviation of the best pose, in units of the noise. Plain rows (n,) have a best χ² below
+    that of :func:`pose_table`, and all their optima are apart and within the limits of the body.
     """
 
     position_m: FloatArray
@@ -47,6 +50,8 @@ class PoseOptima(NamedTuple):
     chi2: FloatArray
     covariance: FloatArray
     counts: NDArray[np.int64]
+    bend: FloatArray
+    is_plain: BoolArray
 
 
 def spread_poses(body: MagnetBody, array: SensorArray, n: int) -> tuple[FloatArray, FloatArray]:
@@ -85,9 +90,9 @@ def features_of(y: FloatArray) -> NDArray[np.float32]:
 
     The field falls with the third power of the distance, so the length of a reading is replaced by its cubic root.
     """
-    square = np.vecdot(y, y)[:, None]
-    scaled = y / np.cbrt(np.maximum(square, np.finfo(np.float64).tiny))
-    return np.concatenate([scaled, np.ones_like(square)], axis=1).astype(np.float32)
+    features = np.ones((len(y), y.shape[1] + 1), dtype=np.float32)
+    features[:, :-1] = y / np.cbrt(np.vecdot(y, y) + _TINY)[:, None]
+    return features
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,21 +105,57 @@ class PoseTable:
         Position in radii from the array's centroid, and rotation matrix.
     table : ndarray of float32, shape (C + 1, M)
         Features of their readings; with the last row, the nearest candidate has the largest product.
+    fit, search : Problem
+        What the kernel needs to know of all rows.
     """
 
     candidates: FloatArray
     table: NDArray[np.float32]
+    fit: core.Problem
+    search: core.Problem
 
 
-def pose_table(model: WhitenedModel, array: SensorArray, body: MagnetBody, n: int = N_CANDIDATES) -> PoseTable:
-    """Return the table of candidates for rows that share a whitening; only the first row of the model counts."""
+def pose_table(
+    model: WhitenedModel,
+    array: SensorArray,
+    body: MagnetBody,
+    n: int = N_CANDIDATES,
+    *,
+    n_starts: int = N_STARTS,
+    keep_within: float = KEEP_WITHIN,
+    most_chi2: float = -math.inf,
+) -> PoseTable:
+    """Return the table of candidates for rows that share a whitening, and how they are searched.
+
+    Only the first row of the model counts. The χ² is that of plain rows at most.
+    """
     position, R = spread_poses(body, array, n)
     usable = _is_clear(body, array, position, R)
     position, R = position[usable], R[usable]
     one = model.rows(np.zeros(len(position), dtype=np.intp))
     features = features_of(one.predict(body_fields(body, array.positions, position, R)) - one.ambient_signals)
     features[:, -1] = -0.5 * np.vecdot(features[:, :-1], features[:, :-1])
-    return PoseTable(packed(model, position, R), np.ascontiguousarray(features.T))
+    candidates, table = packed(model, position, R), np.ascontiguousarray(features.T)
+    limits, fit = body.limits, fit_problem(model, body, None, None, MAX_ITERATIONS)
+    of_rows = ("features", "bend", "is_plain", "pose", "chi2", "covariance", "counts")
+    search = core.problem(
+        "pose_search",
+        fit=fit,
+        n_candidates=len(candidates),
+        n_features=len(table),
+        n_starts=n_starts,
+        n_kept=N_KEPT,
+        keep_within=keep_within,
+        apart=_APART,
+        candidates=candidates,
+        table=table,
+        low=tuple((limits.low_m - model.centroid) / model.radius),
+        high=tuple((limits.high_m - model.centroid) / model.radius),
+        least_trace=1.0 + 2.0 * math.cos(limits.angle_rad),
+        most_chi2=most_chi2,
+        **dict.fromkeys(of_rows),
+    )
+    return PoseTable(candidates, table, fit, search)
 
 
 def _is_clear(body: MagnetBody, array: SensorArray, position: FloatArray, R: FloatArray) -> BoolArray:
@@ -136,24 +177,27 @@ def unpacked(model: WhitenedModel, pose: FloatArray) -> tuple[FloatArray, FloatA
     return model.centroid + model.radius * pose[..., :3], pose[..., 3:].reshape(*pose.shape[:-1], 3, 3)
 
 
-def _covariances(model: WhitenedModel, covariance: FloatArray, R: FloatArray) -> FloatArray:
-    """Return covariances (..., 6, 6) of (δx [m], δθ in the body's frame) from those of the kernels."""
-    change = np.zeros((*R.shape[:-2], 6, 6))
-    change[..., :3, :3] = model.radius * np.eye(3)
-    change[..., 3:, 3:] = np.swapaxes(R, -1, -2)
-    return np.asarray(change @ covariance @ np.swapaxes(change, -1, -2))
+def signals_of_rows(model: WhitenedModel, y: FloatArray) -> FloatArray:
+    """Return whitened readings (b, C) for the kernels, moduli above that of the ambient field."""
+    return signals_of(model, y - model.ambient_signals if model.sees_moduli else y)
 
 
 def fit_problem(
-    model: WhitenedModel, signals: FloatArray, body: MagnetBody, row: IntArray, max_iterations: int, **results: object
+    model: WhitenedModel,
+    body: MagnetBody,
+    signals: FloatArray | None,
+    row: IntArray | None,
+    max_iterations: int,
+    **results: object,
 ) -> core.Problem:
-    """Return the fits of poses for the kernels; `signals` are of :func:`magloc.measurement.channels.signals_of`."""
+    """Return the fits of poses for the kernels, with signals of :func:`signals_of_rows`."""
     of_results = dict.fromkeys(("start", "pose", "chi2", "covariance", "iterations", "converged")) | results
     return core.problem(
         "pose_refinement",
         channels=model.channels,
         n_magnets=len(body.magnets),
         max_iterations=max_iterations,
+        radius=model.radius,
         tolerance=TOLERANCE,
         relative_tolerance=RELATIVE_TOLERANCE,
         places=np.ascontiguousarray(body.positions_m / model.radius),
@@ -179,46 +223,30 @@ def refine_dipoles(
     `row` has the row of the model for each start; by default there is one start a row.
     """
     n = len(position_m)
-    pose, chi2, covariance = np.empty((n, 12)), np.empty(n), np.empty((n, 6, 6))
+    pose, chi2, covariance = np.empty((n, 12)), np.empty(n), np.full((n, 6, 6), np.nan)
     iterations, converged = np.empty(n, np.int64), np.empty(n, np.uint8)
     start = packed(model, position_m, R)
     results: dict[str, object] = {"start": start, "pose": pose, "chi2": chi2, "covariance": covariance}
     results |= {"iterations": iterations, "converged": converged}
-    work = fit_problem(
-        model, signals_of(model, y), body, np.arange(n) if row is None else row, max_iterations, **results
-    )
+    rows = np.arange(n) if row is None else row
+    work = fit_problem(model, body, signals_of_rows(model, y), rows, max_iterations, **results)
     core.run("refine_poses", work, n, block=_ROWS_A_BLOCK)
     position, rotation = unpacked(model, pose)
     fits = PoseFits(position, rotation, np.where(converged, chi2, np.inf), iterations.astype(np.intp))
-    return fits, _covariances(model, covariance, rotation)
+    return fits, covariance
 
 
-def search_poses(
-    model: WhitenedModel,
-    y: FloatArray,
-    body: MagnetBody,
-    table: PoseTable,
-    *,
-    n_starts: int = N_STARTS,
-    keep_within: float = KEEP_WITHIN,
-    max_iterations: int = MAX_ITERATIONS,
-) -> PoseOptima:
-    """Return the distinct optima of whitened rows (n, C) of a body of dipoles."""
+def search_poses(model: WhitenedModel, y: FloatArray, table: PoseTable) -> PoseOptima:
+    """Return the distinct optima of whitened rows (n, C) of the table's body of dipoles."""
     n = len(y)
     pose, chi2 = np.empty((n, N_KEPT, 12)), np.empty((n, N_KEPT))
     covariance, counts = np.empty((n, N_KEPT, 6, 6)), np.empty((n, 3), np.int64)
-    work = core.problem(
-        "pose_search",
-        fit=fit_problem(model, signals_of(model, y), body, np.arange(n), max_iterations),
-        n_candidates=len(table.candidates),
-        n_features=len(table.table),
-        n_starts=n_starts,
-        n_kept=N_KEPT,
-        keep_within=keep_within,
-        apart=_APART,
-        candidates=table.candidates,
-        table=table.table,
-        features=features_of(y - model.ambient_signals),
+    bend, is_plain = np.empty(n), np.empty(n, np.bool_)
+    work = table.search.with_fields(
+        fit=table.fit.with_fields(channels=model.channels, signals=signals_of_rows(model, y), row=np.arange(n)),
+        features=features_of(y - model.ambient_signals if model.sees_moduli else y),
+        bend=bend,
+        is_plain=is_plain.view(np.uint8),
         pose=pose,
         chi2=chi2,
         covariance=covariance,
@@ -226,7 +254,4 @@ def search_poses(
     )
     core.run("search_poses", work, n, block=_ROWS_A_BLOCK)
     most = max(int(counts[:, 0].max(initial=0)), 1)
-    (position, R), chi2 = unpacked(model, pose[:, :most]), chi2[:, :most]
-    known, of_places = np.isfinite(chi2), np.full((n, most, 6, 6), np.nan)
-    of_places[known] = _covariances(model, covariance[:, :most][known], R[known])
-    return PoseOptima(position, R, chi2, of_places, counts)
+    return PoseOptima(*unpacked(model, pose[:, :most]), chi2[:, :most], covariance[:, :most], counts, bend, is_plain)

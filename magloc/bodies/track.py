@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.io.csv import Column
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.fit import linearise
 from magloc.bodies.poses import BodyPoses
@@ -47,9 +47,10 @@ class BodyMotion:
             *(lasts_s, left, *(self.turn_rad_s * parts)),
         ]
 
-    def is_lost(self, dt_s: float, radius_m: float) -> bool:
-        """Return whether a prediction over a gap is too uncertain for one Gaussian."""
-        return self.turn_rad_s * dt_s > _LARGEST_TURN_RAD or self.speed_m_s * dt_s > _LARGEST_WAY * radius_m
+    def is_lost(self, dt_s: FloatArray, radius_m: float) -> BoolArray:
+        """Return whether predictions over gaps (n,) are too uncertain for one Gaussian."""
+        far: BoolArray = self.speed_m_s * dt_s > _LARGEST_WAY * radius_m
+        return (self.turn_rad_s * dt_s > _LARGEST_TURN_RAD) | far
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,8 +45,18 @@ class Problem:
         struct, types = _type_and_fields(kind)
         if fields.keys() != types.keys():
             raise TypeError(f"magloc_{kind} has the fields {[*types]}; instead received {[*fields]}")
-        self.kept = fields
+        self.kind, self.kept = kind, fields
         self.struct = ffi.new(struct, {name: _c_value(name, types[name], value) for name, value in fields.items()})
+
+    def with_fields(self, **changed: Any) -> Problem:
+        """Return a copy with other values of some fields, in less time than a new problem takes."""
+        struct, types = _type_and_fields(self.kind)
+        copy = object.__new__(Problem)
+        copy.kind, copy.kept = self.kind, self.kept | changed
+        copy.struct = ffi.new(struct, self.struct[0])
+        for name, value in changed.items():
+            setattr(copy.struct, name, _c_value(name, types[name], value))
+        return copy
 
 
 @lru_cache  # readings that come one by one describe the same kinds of problems again and again

@@ -8,7 +8,7 @@ int64_t refine_poses(const magloc_pose_refinement &p, int64_t begin, int64_t end
   Channels channels(*p.channels, p.signals, room);
   PoseFit<Lanes> fit(p, channels, room);
   if (!workspace) return room.size();
-  const PoseEnds ends{p.pose, p.chi2, p.covariance, p.iterations, p.converged};
+  const PoseEnds ends{p.pose, p.chi2, p.covariance, p.iterations, p.converged, nullptr};
   fit.run(channels, end - begin, p.row + begin, p.start + 12 * begin, nullptr, ends.from(begin));
   return 0;
 }

@@ -216,7 +216,9 @@ def aligned_fields(
         An argument is not an array of 3-vectors, or the leading axes do not broadcast.
     """
     separation = _vectors("points_m", points_m) - _vectors("position_m", position_m)
-    points, moments = np.broadcast_arrays(separation, _vectors("moment_Am2", moment_Am2))
+    moment = _vectors("moment_Am2", moment_Am2)
+    points, moments = (np.empty(np.broadcast(separation, moment).shape) for _ in range(2))
+    points[...], moments[...] = separation, moment
     axes, number = points.shape[:-1], points.size // 3
     field, jacobian = np.empty((number, 3)), np.empty((number, 3, 7))
     kind, size = shape.kernel_size
@@ -227,8 +229,8 @@ def aligned_fields(
         shape=kind,
         size=size,
         rolls=None if roll is None else np.stack([np.cos(roll), np.sin(roll)], axis=-1),
-        points=np.ascontiguousarray(points).reshape(-1, 3),
-        moments=np.ascontiguousarray(moments).reshape(-1, 3),
+        points=points,
+        moments=moments,
         fields=field,
         jacobians=jacobian,
     )

@@ -22,7 +22,7 @@ from magloc.measurement.magnet import MagnetModel
 
 SENSOR_INSIDE = "the readings put a sensor inside the magnet: its stated size is too large, or its shape is another one"
 DIVERGED = "the fit of the magnet did not converge from any dipole"
-_ROUNDS = 5
+_ROUNDS, _SAME_ROLL_RAD = 5, 1e-4
 # Factor on the distance from the sensors, and number of times, to move a start out of them.
 _AWAY, _MOST_MOVES = 1.25, 12
 # Differences of coordinates q, and of relative strength, below which optima are one.
@@ -43,7 +43,12 @@ def fit_magnet(optima: Optima, magnet: Shape, prior: SourcePrior) -> Optima:
         # The roll at the best fit of each row: from its harmonics at first, then marginalised about its last value.
         best = np.lexsort((fits.chi2, of_row))[first_of_row]
         q, mu = fits.q[best], fits.mu[best]
-        model = model.with_roll(q, mu, exact.y)
+        turned = model.with_roll(q, mu, exact.y)
+        if model.roll_rad is not None and turned.roll_rad is not None:
+            step = np.abs(turned.roll_rad - model.roll_rad)
+            if not (step > _SAME_ROLL_RAD).any():
+                break
+        model = turned
         columns = model.roll_errors(q, mu)
         rows, before = replace(exact, model=model).marginalise(np.where(np.isfinite(columns), columns, 0.0)), fits
         fits = refine(rows.model.rows(of_row), rows.y[of_row], before.q, before.mu)

@@ -64,6 +64,10 @@ def problem(model: WhitenedModel, gain: FloatArray, columns: FloatArray, *, modu
 
 def signals_of(model: WhitenedModel, y: FloatArray) -> FloatArray:
     """Return whitened readings (b, C), followed by those of known parts of the common field."""
+    if len(model) and model.shares_whitening:
+        if model.signal_matrix is None:
+            return np.ascontiguousarray(y)
+        return np.asarray((y[:, None] @ model.signal_matrix)[:, 0])  # one by one: the same for a row in any batch
     known = _known_columns(model)
     if not known.size:
         return np.ascontiguousarray(y)
@@ -71,6 +75,16 @@ def signals_of(model: WhitenedModel, y: FloatArray) -> FloatArray:
     along = (y[:, None] @ basis)[:, 0]
     of_channels = y - (basis @ (shrinkage * along)[..., None])[..., 0]
     return np.concatenate([of_channels, -np.sqrt(shrinkage * (2.0 - shrinkage)) * along], axis=1)
+
+
+def signal_matrix_of(model: WhitenedModel) -> FloatArray | None:
+    """Return the matrix (C, C + k) of :func:`signals_of` of rows that share a whitening; None if nothing is known."""
+    known = _known_columns(model)
+    if not known.size:
+        return None
+    basis, shrinkage = model.basis[0][:, known], model.shrinkage[0, known]
+    free = np.eye(len(basis)) - (shrinkage * basis) @ basis.T
+    return np.concatenate([free, -np.sqrt(shrinkage * (2.0 - shrinkage)) * basis], axis=1)
 
 
 def _known_columns(model: WhitenedModel) -> NDArray[np.intp]:

@@ -8,7 +8,7 @@ has a roll about its axis, an unknown of each row besides the state.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ UNKNOWN_ROLL_RAD = math.radians(90.0) / math.sqrt(12.0)
 """Standard deviation of a uniform roll of a cuboid with four-fold symmetry."""
 LARGEST_M = 0.5
 """Length beyond that of all single magnets [m], unless the array is larger."""
+_KEPT = 2
 _LARGEST_ROLL_STEP_RAD = math.radians(15.0)
 
 
@@ -102,6 +103,9 @@ class MagnetModel(WhitenedModel):
 
     magnet: Shape
     roll_rad: FloatArray | None = None
+    _last: dict[tuple[bytes, bytes, bytes | None], tuple[FloatArray, FloatArray]] = field(
+        default_factory=dict, init=False
+    )
 
     @classmethod
     def near(cls, model: WhitenedModel, magnet: Shape) -> MagnetModel:
@@ -124,10 +128,18 @@ class MagnetModel(WhitenedModel):
         return np.asarray(self._fields(q, mu, self.roll_rad)[0].sum(axis=1))
 
     def _fields(self, q: FloatArray, mu: FloatArray, roll_rad: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """Return the field (b, K, N, 3) of every magnet and its Jacobian."""
-        sensors = self.centroid + self.radius * self.sensors
-        position, moment = self.position(q)[:, :, None], self.moment(q, mu)[:, :, None]
-        return aligned_fields(self.magnet, sensors, position, moment, roll_rad)
+        """Return the field (b, K, N, 3) of every magnet and its Jacobian.
+
+        A step of a fit asks for them at two states, several times at each: the last two results are kept.
+        """
+        key = q.tobytes(), mu.tobytes(), None if roll_rad is None else roll_rad.tobytes()
+        if key not in self._last:
+            sensors = self.centroid + self.radius * self.sensors
+            position, moment = self.position(q)[:, :, None], self.moment(q, mu)[:, :, None]
+            if len(self._last) == _KEPT:
+                del self._last[next(iter(self._last))]
+            self._last[key] = aligned_fields(self.magnet, sensors, position, moment, roll_rad)
+        return self._last[key]
 
     def _by_state(self, q: FloatArray, mu: FloatArray, gain: FloatArray) -> FloatArray:
         """Return the derivative (b, K, C, 7) of the channels by (p, m) and the roll of every magnet."""

@@ -18,7 +18,7 @@ from arrays.typing import FloatArray
 from arrays.whitening import Whitening
 from magloc import core
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.measurement.channels import channels_of
+from magloc.measurement.channels import channels_of, signal_matrix_of
 from magloc.measurement.known_moment import KnownMoment
 
 # Largest squares, relative to noise, with negligible rounding errors; relative size of a column that counts as zero.
@@ -144,6 +144,11 @@ class WhitenedModel(ScaledSensors):
         """Whitened readings without a source (b, C), or (1, C) if equal in all rows."""
         alone = self.rows(np.arange(min(1, len(self)))) if self.shares_whitening and self.shares_ambient else self
         return alone.predict(np.zeros(alone.ambient.shape))
+
+    @cached_property
+    def signal_matrix(self) -> FloatArray | None:
+        """Matrix from whitened readings to the signals of kernels, if all rows share one; None if it is the unit."""
+        return signal_matrix_of(self)
 
     @cached_property
     def channels(self) -> core.Problem:

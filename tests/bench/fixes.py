@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -92,14 +93,17 @@ def magnets(size: Size) -> Iterator[Row]:
         field = aligned_fields(magnet, array.positions, position[:, None], moment[:, None], 0.3)[0]
         readings = field.reshape(size.rows, -1) + 1e-6 * rng.normal(size=(size.rows, array.n_channels))
         ours, dipoles = plain_locator(array, magnet=magnet), plain_locator(array, body_length_m=0.0)
+        few = readings[: size.problems]
         contestants = {
             "magnet": Contestant(lambda locator=ours, z=readings: locator.fit_rows(z), 1, size.rows),
             "dipole": Contestant(lambda locator=dipoles, z=readings: locator.fit_rows(z), 1, size.rows),
+            "magnet alone": Contestant(lambda locator=ours, z=few: [locator.fit(row) for row in z], 1, len(few)),
+            "dipole alone": Contestant(lambda locator=dipoles, z=few: [locator.fit(row) for row in z], 1, len(few)),
         }
         timings = interleaved(contestants, size.rounds)
-        yield Row(
-            f"a {magnet.kind} near, {size.rows:,} at once, 1 thr.", timings["magnet"], "a dipole", timings["dipole"]
-        )
+        for what, alone in ((f"{size.rows:,} at once", ""), ("one alone", " alone")):
+            ours_s, dipole_s = timings[f"magnet{alone}"], timings[f"dipole{alone}"]
+            yield Row(f"a {magnet.kind} near, {what}, 1 thr.", ours_s, "a dipole", dipole_s)
 
 
 def bodies(size: Size) -> Iterator[Row]:
@@ -113,9 +117,10 @@ def bodies(size: Size) -> Iterator[Row]:
     of_dipoles += array.channel_noise_T * rng.normal(size=of_dipoles.shape)
     moving = record(array, body, size.rows, 7)[0]
     locator, dipoles = BodyLocator(array, body), plain_locator(array, body_length_m=0.0)
-    tracker = BodyTracker(array, body)
+    sensors = [replace(sensor, offset_uncertainty_T=2e-5, gain_uncertainty=0.03) for sensor in array.sensors]
+    exact, uncertain = BodyTracker(array, body), BodyTracker(replace(array, sensors=tuple(sensors)), body)
 
-    def track() -> None:
+    def track(tracker: BodyTracker) -> None:
         tracker.restart()
         tracker.follow(moving.values_T, moving.time_s)
 
@@ -125,7 +130,8 @@ def bodies(size: Size) -> Iterator[Row]:
             "dipole alone": Contestant(lambda: [dipoles.fit(of_dipoles[i]) for i in few], 1, len(few)),
             "body": Contestant(lambda: locator.fit_rows(readings), 1, size.rows),
             "dipole": Contestant(lambda: dipoles.fit_rows(of_dipoles), 1, size.rows),
-            "track": Contestant(track, 1, size.rows),
+            "track": Contestant(lambda: track(exact), 1, size.rows),
+            "track with errors": Contestant(lambda: track(uncertain), 1, size.rows),
         },
         size.rounds,
     )
@@ -134,6 +140,7 @@ def bodies(size: Size) -> Iterator[Row]:
         ("a body of three magnets, one alone", "body alone", "dipole alone"),
         (f"a body, {size.rows:,} at once", "body", "dipole"),
         (f"a body, {size.rows:,} rows tracked", "track", "dipole"),
+        ("the same, 18 lasting errors of the sensors", "track with errors", "dipole"),
     ):
         yield Row(f"{what}, 1 thr.", timings[ours], f"fix of {peer}", timings[peer], f"poses {found}/{size.rows}")
 

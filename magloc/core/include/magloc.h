@@ -373,11 +373,12 @@ typedef struct {
 int64_t magloc_refine(const magloc_refinement *problem, int64_t begin, int64_t end, double *workspace);
 
 /* A rigid body of dipoles; an item is a start. A pose is its position, in radii from the array's centroid, and the
-   rotation matrix from the body's frame to the array's. Covariances are of the position in radii and of a small
-   rotation about the array's axes. */
+   rotation matrix from the body's frame to the array's. Covariances are of the position in metres and of a small
+   rotation about the body's axes; those of fits that did not converge are not written. */
 typedef struct {
   const magloc_channels *channels;
   int64_t n_magnets, max_iterations;
+  double radius;                        /* [m] */
   double tolerance, relative_tolerance; /* a fit ends if a step would lower chi-square by less */
   const double *places, *moments;       /* (n_magnets, 3) in the body's frame: radii, and T at one radius */
   const double *signals;            /* (n_rows, n_channels) whitened readings; of moduli, above the ambient field's */
@@ -398,6 +399,10 @@ typedef struct {
   const double *candidates; /* (n_candidates, 12) */
   const float *table;       /* (n_features, n_candidates) */
   const float *features;    /* (n_rows, n_features) of the readings; starts have the largest products with the table */
+  double low[3], high[3], least_trace; /* limits of positions, in radii, and of the trace of rotation matrices */
+  double most_chi2;                    /* of plain rows */
+  double *bend;      /* (n_rows) of the readings over one standard deviation of the best pose, in units of the noise */
+  uint8_t *is_plain; /* (n_rows) 1 if all optima are apart and within the limits, and the best one's chi-square is */
   double *pose, *chi2, *covariance; /* (n_rows, n_kept, 12), (n_rows, n_kept), (n_rows, n_kept, 6, 6); NaN for none */
   int64_t *counts;                  /* (n_rows, 3): optima, starts that did not converge, linearisations */
 } magloc_pose_search;

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.refinement import MOST_SOURCES, OPTIMUM_TOLERANCE, RELATIVE_TOLERANCE, refine_starts
 from magloc.measurement.whitened import WhitenedModel
-from magloc.navigation.rotations import unit_across
+from magloc.navigation.rotations import cross_matrix, unit_across
 
 # Predicted decrease of χ², absolute and relative, below which a fit has converged.
 PROMISE_ABSOLUTE = 1e-8
@@ -117,7 +117,7 @@ def tangents(q: FloatArray) -> FloatArray:
     length = np.linalg.norm(u, axis=-1, keepdims=True)
     direction = np.where(length > 1e-12, u / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
     first = unit_across(direction)
-    second = np.cross(direction, first)
+    second = (cross_matrix(direction) @ first[..., None])[..., 0]
     zero = np.zeros_like(s)
     columns = (
         np.concatenate([first, zero], axis=-1),
@@ -345,10 +345,11 @@ def _take_step(
     longest = np.max(np.linalg.norm(along, axis=-1), axis=-1)
     share = np.minimum(1.0, LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
     moved = q + (tangent @ (share[:, None, None] * along)[..., None])[..., 0]
-    # A step along the tangents lengthens u slightly; restore its length if the range is constant.
-    held = ~np.isin(3 * np.arange(n_sources) + 2, columns)
-    before, after = (np.linalg.norm(x[:, held, :3], axis=-1, keepdims=True) for x in (q, moved))
-    moved[:, held, :3] *= before / np.maximum(after, 1e-300)
+    if columns.size < 3 * n_sources:
+        # A step along the tangents lengthens u slightly; restore its length if the range is constant.
+        held = ~np.isin(3 * np.arange(n_sources) + 2, columns)
+        before, after = (np.linalg.norm(x[:, held, :3], axis=-1, keepdims=True) for x in (q, moved))
+        moved[:, held, :3] *= before / np.maximum(after, 1e-300)
     turned = step[:, columns.size :].reshape(n_fits, n_sources, 3)
     new_mu = mu + share[:, None, None] * turned
     norm = np.linalg.norm(moved, axis=-1, keepdims=True)

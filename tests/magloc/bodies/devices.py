@@ -52,8 +52,8 @@ def random_poses(body: MagnetBody, n: int, rng: np.random.Generator) -> tuple[np
 def readings_of(
     array: SensorArray, body: MagnetBody, position_m: np.ndarray, R: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return readings (n, C) of poses in an ambient field that the array's prior describes, with noise."""
-    fields = body_fields(body, array.positions, position_m, R)
+    """Return readings (n, C) of poses in the array's ambient field and one that its prior describes, with noise."""
+    fields = array.ambient_fields + body_fields(body, array.positions, position_m, R)
     if array.common_field_T is not None:
         fields = fields + array.common_field_T * rng.normal(size=(len(fields), 1, 3))
     return np.asarray(

@@ -33,9 +33,11 @@ struct PoseEnds {
   double *pose, *chi2, *covariance;
   int64_t *iterations;
   uint8_t *converged;
+  double *nearest;  // inverse distance of a magnet from a sensor, or null
 
   PoseEnds from(int64_t i) const {
-    return {pose + 12 * i, chi2 + i, covariance + 36 * i, iterations + i, converged + i};
+    return {pose + 12 * i,  chi2 + i,      covariance + 36 * i,
+            iterations + i, converged + i, nearest ? nearest + i : nullptr};
   }
 };
 
@@ -84,9 +86,10 @@ class PoseFit {
       for (int a = 0; a < 3; ++a) out.pose[12 * k + a] = get_lane(at.x[a], lane);
       for (int a = 0; a < 9; ++a) out.pose[12 * k + 3 + a] = get_lane(at.R[a / 3][a % 3], lane);
       out.chi2[k] = get_lane(at.chi2, lane);
+      if (out.nearest) out.nearest[k] = get_lane(at.nearest, lane);
       out.iterations[k] = (int64_t)get_lane(iterations, lane);
       out.converged[k] = get_lane(end, lane) == converged;
-      fill_covariance(at, lane, out.covariance + 36 * k);
+      if (out.converged[k]) fill_covariance(at, lane, out.covariance + 36 * k);
     };
     while (items.refill(end, begin)) {
       linearise(c, trial);
@@ -168,27 +171,27 @@ class PoseFit {
       for (int j = 0; j < D; ++j) columns_[D * i + j] = T{};
     }
     for (int64_t s = 0; s < c.n_sensors; ++s) {
-      T b[3] = {}, by_place[3][3] = {}, by_turn[3][3] = {};
+      T b[3] = {}, slope[3][3] = {}, way[3], by_place[3][3], by_turn[3][3];
+      for (int i = 0; i < 3; ++i) way[i] = c.sensors[3 * s + i] - p.x[i];
       for (int64_t k = 0; k < p_.n_magnets; ++k) {
-        const T(&arm)[3] = reinterpret_cast<const T(&)[3]>(arms_[3 * k]);
         const T(&m)[3] = reinterpret_cast<const T(&)[3]>(moments_[3 * k]);
-        T d[3], of_magnet[3], g[3][3], a[3][3];
-        for (int i = 0; i < 3; ++i) d[i] = c.sensors[3 * s + i] - p.x[i] - arm[i];
+        T d[3], of_magnet[3], g[3][3];
+        for (int i = 0; i < 3; ++i) d[i] = way[i] - arms_[3 * k + i];
         const Ray<T> ray = Ray<T>::from(d);
         p.nearest = maximum(p.nearest, ray.inverse_r);
         field(ray, m, of_magnet);
         gradient(ray, m, g);
-        field_matrix(ray, a);
         for (int i = 0; i < 3; ++i) {
-          T of_moment[3], of_arm[3];
-          cross(m, a[i], of_moment);
-          cross(arm, g[i], of_arm);
           b[i] += of_magnet[i];
-          for (int j = 0; j < 3; ++j) {
-            by_place[i][j] -= g[i][j];
-            by_turn[i][j] += of_moment[j] - of_arm[j];
-          }
+          for (int j = 0; j <= i; ++j) slope[i][j] += g[i][j];
         }
+      }
+      // A small rotation psi of body and sensor changes the field by psi x b; that of the sensor by slope (psi x way).
+      for (int i = 0; i < 3; ++i) {
+        const int j = (i + 1) % 3, k = (i + 2) % 3;
+        for (int l = 0; l < 3; ++l) by_place[i][l] = -(l > i ? slope[l][i] : slope[i][l]);
+        cross(way, by_place[i], by_turn[i]);
+        by_turn[i][j] += b[k], by_turn[i][k] -= b[j];
       }
       c.linearise_at(s, b);
       c.fill_residual(s, b, residual_);
@@ -261,17 +264,29 @@ class PoseFit {
     return (way2 * at.nearest * at.nearest + 0.5 * turn2 < beside2) & (beyond < most) & (-beyond < most);
   }
 
-  // Inverse of the information, which is scaled to a unit diagonal; NaN if it is singular.
-  static void fill_covariance(const PoseState<T> &at, int lane, double *covariance) {
-    double scale[D], a[D][D];
+  // Inverse of the information, which is scaled to a unit diagonal, of the position in metres and a rotation about the
+  // body's axes; NaN if it is singular.
+  void fill_covariance(const PoseState<T> &at, int lane, double *covariance) const {
+    double scale[D], a[D][D], in_body[D][D];
     for (int j = 0; j < D; ++j) scale[j] = 1.0 / square_root(get_lane(at.information[j][j], lane));
     for (int j = 0; j < D; ++j)
       for (int k = 0; k <= j; ++k) a[j][k] = scale[j] * scale[k] * get_lane(at.information[j][k], lane);
     const double definite = Ldl<double, D>(a, 1e-13).definite();
     invert_and_negate(a);
     for (int j = 0; j < D; ++j)
-      for (int k = 0; k <= j; ++k)
-        covariance[D * j + k] = covariance[D * k + j] = -definite * scale[j] * scale[k] * a[j][k];
+      for (int k = 0; k <= j; ++k) a[j][k] = a[k][j] = -definite * scale[j] * scale[k] * a[j][k];
+    const auto change = [&](const double *row, double *result) {
+      for (int j = 0; j < 3; ++j) {
+        result[j] = p_.radius * row[j], result[3 + j] = 0.0;
+        for (int k = 0; k < 3; ++k) result[3 + j] += row[3 + k] * get_lane(at.R[k][j], lane);
+      }
+    };
+    for (int j = 0; j < D; ++j) {
+      double row[D];
+      change(a[j], row);
+      for (int k = 0; k < D; ++k) in_body[k][j] = row[k];
+    }
+    for (int j = 0; j < D; ++j) change(in_body[j], covariance + D * j);
   }
 };
 
@@ -279,12 +294,13 @@ class PoseFit {
 // distinct optima are put out, best first.
 template <class T, class Channels>
 class PoseSearch {
-  static constexpr int64_t block = 64;
+  static constexpr int64_t block = 64, together = 4;
+  static constexpr int partial = 16;
   static constexpr double same_way2 = 1e-8, same_turn2 = 1e-8;
   const magloc_pose_search &p_;
   Channels channels_;
   PoseFit<T> fit_;
-  const int64_t n_blocks_;
+  const int64_t n_blocks_, n_highest_;
   float *const score_, *const highest_;
   double *const start_;
   KnownPose *const known_;
@@ -300,15 +316,20 @@ class PoseSearch {
         channels_(*p.fit->channels, p.fit->signals, room),
         fit_(*p.fit, channels_, room),
         n_blocks_((p.n_candidates + block - 1) / block),
+        n_highest_((n_blocks_ + partial - 1) / partial * partial),
         score_(room.take<float>(n_blocks_ * block)),
-        highest_(room.take<float>(n_blocks_)),
+        highest_(room.take<float>(n_highest_)),
         start_(room.take<double>(12 * rows_together * p.n_starts)),
         known_(room.take<KnownPose>(rows_together * p.n_starts)),
         row_(room.take<int64_t>(rows_together * p.n_starts)),
         iterations_(room.take<int64_t>(rows_together * p.n_starts)),
         converged_(room.take<uint8_t>(rows_together * p.n_starts)),
-        ends_{room.take<double>(12 * rows_together * p.n_starts), room.take<double>(rows_together * p.n_starts),
-              room.take<double>(36 * rows_together * p.n_starts), iterations_, converged_} {}
+        ends_{room.take<double>(12 * rows_together * p.n_starts),
+              room.take<double>(rows_together * p.n_starts),
+              room.take<double>(36 * rows_together * p.n_starts),
+              iterations_,
+              converged_,
+              room.take<double>(rows_together * p.n_starts)} {}
 
   // The first starts of all rows come first: what they find ends others that lead there, too.
   void run(int64_t begin, int64_t n_rows) {
@@ -341,16 +362,11 @@ class PoseSearch {
   }
 
   void choose_starts(int64_t row, int64_t i, int64_t n_rows, int64_t n_first) {
-    const float *q = p_.features + p_.n_features * row;
-    const int64_t n = p_.n_candidates;
-    for (int64_t j = 0; j < n_blocks_ * block; ++j) score_[j] = j < n ? 0.0f : -__builtin_inff();
-    for (int64_t f = 0; f < p_.n_features; ++f) {
-      const float *column = p_.table + f * n, x = q[f];
-      for (int64_t j = 0; j < n; ++j) score_[j] += x * column[j];
-    }
-    for (int64_t b = 0; b < n_blocks_; ++b) highest_[b] = largest(score_ + b * block, block);
+    fill_scores(p_.features + p_.n_features * row);
+    for (int64_t b = 0; b < n_highest_; ++b)
+      highest_[b] = b < n_blocks_ ? largest(score_ + b * block, block) : -__builtin_inff();
     for (int64_t found = 0; found < p_.n_starts;) {
-      const float best = largest(highest_, n_blocks_);
+      const float best = largest(highest_, n_highest_);
       const int64_t at = place(i, found, n_rows, n_first);
       row_[at] = i;
       if (!(best > -__builtin_inff())) {  // none is left: the best again
@@ -370,9 +386,29 @@ class PoseSearch {
       ++found;
     }
   }
+  // Products of the candidates with the features of a row, four features in a pass.
+  void fill_scores(const float *features) {
+    const int64_t n = p_.n_candidates, n_features = p_.n_features;
+    for (int64_t j = 0; j < n_blocks_ * block; ++j) score_[j] = j < n ? 0.0f : -__builtin_inff();
+    for (int64_t f = 0; f < n_features; f += together) {
+      const float *column[together];
+      float x[together];
+      for (int64_t k = 0; k < together; ++k) {
+        const bool is_feature = f + k < n_features;
+        column[k] = p_.table + (is_feature ? f + k : f) * n, x[k] = is_feature ? features[f + k] : 0.0f;
+      }
+      for (int64_t j = 0; j < n; ++j)
+        score_[j] += x[0] * column[0][j] + x[1] * column[1][j] + x[2] * column[2][j] + x[3] * column[3][j];
+    }
+  }
+  // Largest of n numbers, a multiple of the partial ones, which are independent of each other.
   static float largest(const float *x, int64_t n) {
-    float result = x[0];
-    for (int64_t i = 1; i < n; ++i) result = x[i] > result ? x[i] : result;
+    float part[partial];
+    for (int k = 0; k < partial; ++k) part[k] = x[k];
+    for (int64_t i = partial; i < n; i += partial)
+      for (int k = 0; k < partial; ++k) part[k] = x[i + k] > part[k] ? x[i + k] : part[k];
+    float result = part[0];
+    for (int k = 1; k < partial; ++k) result = part[k] > result ? part[k] : result;
     return result;
   }
   static int64_t first_of(float value, const float *x) {
@@ -387,6 +423,21 @@ class PoseSearch {
     return way2 + 0.5 * turn2;
   }
 
+  bool is_within(const double *pose) const {
+    bool result = pose[3] + pose[7] + pose[11] >= p_.least_trace;
+    for (int a = 0; a < 3; ++a) result = result && pose[a] >= p_.low[a] && pose[a] <= p_.high[a];
+    return result;
+  }
+  // How far readings bend over one standard deviation of a pose, in units of the noise.
+  double bend_of(int64_t row, int64_t end) const {
+    const int64_t n = channels_.n_channels;
+    const double *const signals = p_.fit->signals + n * p_.fit->row[row], way = ends_.nearest[end] / p_.fit->radius;
+    double square = 0.0, spread = 0.0;
+    for (int64_t c = 0; c < n; ++c) square += signals[c] * signals[c];
+    for (int a = 0; a < 6; ++a) spread += (a < 3 ? 6.0 * way * way : 0.5) * ends_.covariance[36 * end + 7 * a];
+    return spread * square_root(square / (double)channels_.first(channels_.n_sensors));
+  }
+
   void put_optima(int64_t row, int64_t i, int64_t n_rows, int64_t n_first) {
     int64_t *counts = p_.counts + 3 * row, kept = 0;
     const int64_t to = row * p_.n_kept;
@@ -396,6 +447,7 @@ class PoseSearch {
       counts[1] += !ends_.converged[e];
       counts[2] += ends_.iterations[e];
     }
+    p_.bend[row] = nan, p_.is_plain[row] = Channels::linear;
     while (kept < p_.n_kept) {
       int64_t best = -1;
       for (int64_t k = 0; k < p_.n_starts; ++k) {
@@ -411,8 +463,14 @@ class PoseSearch {
       if (same) continue;
       __builtin_memcpy(p_.pose + 12 * (to + kept), ends_.pose + 12 * best, 12 * sizeof(double));
       __builtin_memcpy(p_.covariance + 36 * (to + kept), ends_.covariance + 36 * best, 36 * sizeof(double));
+      if (!kept) p_.bend[row] = bend_of(row, best);
+      if (!is_within(p_.pose + 12 * (to + kept))) p_.is_plain[row] = 0;
+      for (int64_t o = to; o < to + kept; ++o)
+        if (square_of_distance(p_.pose + 12 * (to + kept), p_.pose + 12 * o) < p_.apart * p_.apart)
+          p_.is_plain[row] = 0;
       p_.chi2[to + kept++] = ends_.chi2[best];
     }
+    if (!kept || !(p_.chi2[to] < p_.most_chi2) || !(p_.bend[row] < infinity)) p_.is_plain[row] = 0;
     counts[0] = kept;
     for (int64_t o = to + kept; o < to + p_.n_kept; ++o) {
       for (int a = 0; a < 12; ++a) p_.pose[12 * o + a] = nan;

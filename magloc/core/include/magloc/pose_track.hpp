@@ -1,58 +1,27 @@
 // A body followed over rows: an iterated extended Kalman filter of its pose, its rates, and lasting errors of magnets
 // and sensors. magloc/bodies/readable_filter.py is the readable reference.
 //
-// Readings depend on the pose and the errors only, the first d states. An update is Gauss-Newton on these,
-// with the inverse of their predicted covariance as information of the prior; the rates follow by regression.
+// Readings depend on the pose and the errors only, the first d states. An update repeats that of a Kalman filter about
+// the last pose. The readings are linear in the sensors' errors, so their part of the gain is computed once a row.
 #pragma once
 #include "body.hpp"
+#include "padded.hpp"
 
 MAGLOC_BEGIN
-// Square matrices in the caller's memory, row by row.
-struct Square {
-  double *a;
-  int64_t n;
-
-  double *operator[](int64_t i) const { return a + n * i; }
-};
-
-// Invert a symmetric positive matrix in place, by the sweep operator; it is scaled to a unit diagonal first.
-inline void invert(const Square &m, double *scale, double *column) {
-  const int64_t n = m.n;
-  for (int64_t i = 0; i < n; ++i) scale[i] = m[i][i] > 0.0 ? 1.0 / square_root(m[i][i]) : 1.0;
-  for (int64_t i = 0; i < n; ++i)
-    for (int64_t j = 0; j < n; ++j) m[i][j] *= scale[i] * scale[j];
-  for (int64_t k = 0; k < n; ++k) {
-    const double inverse = 1.0 / m[k][k];
-    for (int64_t i = 0; i < n; ++i) column[i] = m[i][k];
-    for (int64_t i = 0; i < n; ++i) {
-      if (i == k) continue;
-      const double share = inverse * column[i];
-      for (int64_t j = 0; j < n; ++j) m[i][j] -= share * column[j];
-    }
-    for (int64_t i = 0; i < n; ++i) m[i][k] = m[k][i] = inverse * column[i];
-    m[k][k] = -inverse;
-  }
-  for (int64_t i = 0; i < n; ++i)
-    for (int64_t j = 0; j < n; ++j) m[i][j] *= -scale[i] * scale[j];
-}
-
 template <class Channels>
 class BodyFilter {
   static constexpr int64_t pose = 6, rates = 6;
   const magloc_pose_track &p_;
   Channels channels_;
   PoseFit<double> fit_;
-  const int64_t q_, a_, d_, n_, c_;
-  const Square P_, moved_, prior_, posterior_;
-  double weight_ = 0.0;  // of a row
-  double *const F_,
-      *const columns_, *const error_, *const gradient_,
-                                          *const step_, *const scale_, *const column_,
-                                                                           *const gain_, *const lost_,
-                                                                                             *const rest_,
-                                                                                                 *const of_magnet_,
-                                                                                                     *const strength_,
-                                                                                                         *const errors_;
+  const int64_t q_, a_, p_states_, d_, n_, c_;  // p_states_: pose and errors of the magnets
+  // By the states: covariance, derivatives of the channels H, H P, and the part of H P by the sensors' errors.
+  const Padded<Lanes> P_, H_, HP_, of_sensors_;
+  const Padded<Lanes> S_;      // of the channels: covariance I + H P H^T, and the innovation
+  const Padded<Lanes> error_;  // one row of the states
+  double weight_ = 0.0;        // of a row
+  double *const rest_, *const multiplier_, *const ahead_, *const of_magnet_, *const strength_, *const errors_,
+                                                                                                   *const turned_;
 
  public:
   BodyFilter(const magloc_pose_track &p, Workspace &room)
@@ -61,29 +30,27 @@ class BodyFilter {
         fit_(*p.fit, channels_, room),
         q_(p.n_magnet_errors),
         a_(p.n_sensor_errors),
-        d_(pose + q_ + a_),
+        p_states_(pose + q_),
+        d_(p_states_ + a_),
         n_(d_ + rates),
         c_(p.fit->channels->n_channels),
-        P_{p.covariance, n_},
-        moved_{room.take<double>(n_ * n_), n_},
-        prior_{room.take<double>(d_ * d_), d_},
-        posterior_{room.take<double>(d_ * d_), d_},
-        F_(room.take<double>(n_ * n_)),
-        columns_(room.take<double>(d_ * c_)),
-        error_(room.take<double>(d_)),
-        gradient_(room.take<double>(d_)),
-        step_(room.take<double>(d_)),
-        scale_(room.take<double>(d_)),
-        column_(room.take<double>(d_)),
-        gain_(room.take<double>(rates * d_)),
-        lost_(room.take<double>(d_)),
+        P_(room, n_, n_),
+        H_(room, c_, n_),
+        HP_(room, c_, n_),
+        of_sensors_(room, c_, n_),
+        S_(room, c_, c_ + 1),
+        error_(room, 1, n_),
         rest_(room.take<double>(c_)),
+        multiplier_(room.take<double>(c_)),
+        ahead_(room.take<double>(c_)),
         of_magnet_(room.take<double>(c_)),
         strength_(room.take<double>(p.fit->n_magnets)),
-        errors_(room.take<double>(q_ + a_)) {}
+        errors_(room.take<double>(q_)),
+        turned_(room.take<double>(p_states_)) {}
 
   void follow(int64_t row) {
     if (!p_.progress[1]) return;
+    P_.load(p_.covariance, n_, n_);
     predict(p_.steps + 10 * row, a_ ? p_.lasting + a_ * row : nullptr, a_ ? p_.added + a_ * row : nullptr);
     channels_.load(0, p_.fit->row[row]);
     const bool agrees = update(row);
@@ -92,6 +59,7 @@ class BodyFilter {
     if (p_.progress[0] >= p_.most_contradictions) p_.progress[1] = 0;
     __builtin_memcpy(p_.poses + 12 * row, p_.pose, 12 * sizeof(double));
     __builtin_memcpy(p_.all_rates + rates * row, p_.rates, rates * sizeof(double));
+    P_.store(p_.covariance, n_, n_);
     double *const covariance = p_.covariances + 144 * row;
     for (int64_t i = 0; i < 12; ++i)
       for (int64_t j = 0; j < 12; ++j) covariance[12 * i + j] = P_[i < 6 ? i : d_ + i - 6][j < 6 ? j : d_ + j - 6];
@@ -109,24 +77,17 @@ class BodyFilter {
       p_.rates[3 + i] *= of_turn[1];
     }
     turn_body(p_.pose + 3, turn);
-    for (int64_t i = 0; i < n_ * n_; ++i) F_[i] = 0.0;
-    for (int64_t i = 0; i < n_; ++i) F_[n_ * i + i] = 1.0;
-    for (int i = 0; i < 3; ++i) {
-      const int64_t x = i, theta = 3 + i, v = d_ + i, omega = d_ + 3 + i, j = 3 + (i + 1) % 3, k = 3 + (i + 2) % 3;
-      F_[n_ * x + v] = of_x[0], F_[n_ * v + v] = of_x[1];
-      F_[n_ * theta + omega] = of_turn[0], F_[n_ * omega + omega] = of_turn[1];
-      F_[n_ * theta + k] = -turn[(i + 1) % 3], F_[n_ * theta + j] = turn[(i + 2) % 3];  // -[turn]x
-    }
-    for (int64_t e = 0; e < a_; ++e) {
-      F_[(n_ + 1) * (pose + q_ + e)] = lasting[e];
-      p_.errors[q_ + e] *= lasting[e];
-    }
-    propagate();
+    for (int64_t e = 0; e < a_; ++e) p_.errors[q_ + e] *= lasting[e];
+    // F P F^T: rows of P, then its columns.
+    propagate([this](int64_t i, int64_t j) -> double & { return P_[i][j]; }, steps, turn, lasting);
+    propagate([this](int64_t i, int64_t j) -> double & { return P_[j][i]; }, steps, turn, lasting);
+    for (int64_t i = 0; i < n_; ++i)
+      for (int64_t j = 0; j < i; ++j) P_[i][j] = P_[j][i];
     for (int i = 0; i < 3; ++i) {
       add_noise(i, d_ + i, of_x + 2);
       add_noise(3 + i, d_ + 3 + i, of_turn + 2);
     }
-    for (int64_t e = 0; e < a_; ++e) P_[pose + q_ + e][pose + q_ + e] += added[e] * added[e];
+    for (int64_t e = 0; e < a_; ++e) P_[p_states_ + e][p_states_ + e] += added[e] * added[e];
   }
   void add_noise(int64_t i, int64_t rate, const double *root) {
     P_[i][i] += root[0] * root[0];
@@ -134,25 +95,21 @@ class BodyFilter {
     P_[rate][i] = P_[i][rate];
     P_[rate][rate] += root[1] * root[1] + root[2] * root[2];
   }
-  // P becomes F P F^T; rows of F have few numbers that are not zero.
-  void propagate() {
-    for (int64_t i = 0; i < n_; ++i) {
-      for (int64_t j = 0; j < n_; ++j) moved_[i][j] = 0.0;
-      for (int64_t k = 0; k < n_; ++k) {
-        const double f = F_[n_ * i + k];
-        if (f == 0.0) continue;
-        for (int64_t j = 0; j < n_; ++j) moved_[i][j] += f * P_[k][j];
+  template <class At>
+  void propagate(At at, const double *steps, const double (&turn)[3], const double *lasting) {
+    for (int64_t j = 0; j < n_; ++j) {
+      double rotation[3], before[3];
+      for (int i = 0; i < 3; ++i) before[i] = at(3 + i, j);
+      cross(before, turn, rotation);
+      for (int i = 0; i < 3; ++i) {
+        double &velocity = at(d_ + i, j), &rate = at(d_ + 3 + i, j);
+        at(i, j) += steps[0] * velocity;
+        at(3 + i, j) += rotation[i] + steps[5] * rate;
+        velocity *= steps[1], rate *= steps[6];
       }
     }
-    for (int64_t i = 0; i < n_; ++i)
-      for (int64_t j = 0; j <= i; ++j) {
-        double sum = 0.0;
-        for (int64_t k = 0; k < n_; ++k)
-          if (F_[n_ * j + k] != 0.0) sum += moved_[i][k] * F_[n_ * j + k];
-        P_[i][j] = sum;
-      }
-    for (int64_t i = 0; i < n_; ++i)
-      for (int64_t j = 0; j < i; ++j) P_[j][i] = P_[i][j];
+    for (int64_t e = 0; e < a_; ++e)
+      for (int64_t j = 0; j < n_ && lasting[e] != 1.0; ++j) at(p_states_ + e, j) *= lasting[e];
   }
 
   // Rotate a body by a small vector in its own frame: R exp([turn]x).
@@ -166,46 +123,42 @@ class BodyFilter {
       for (int j = 0; j < 3; ++j) R[3 * j + i] = result[i][j];
   }
 
-  // Linearise about the trial state: columns (d, n_channels) and the residual, whose square is returned.
-  double linearise(const PoseState<double> &trial, int64_t row) {
+  // Linearise about a state: columns of H by pose and magnets, and the residual about the predicted sensors' errors.
+  void linearise(const PoseState<double> &trial, int64_t row) {
     PoseState<double> state = trial;
     for (int64_t k = 0; k < p_.fit->n_magnets; ++k) {
       strength_[k] = 1.0;
       for (int64_t e = 0; e < q_; ++e) strength_[k] += p_.magnet_errors[q_ * k + e] * errors_[e];
     }
     fit_.linearise(channels_, state, strength_);
-    const double *by_pose = fit_.columns();
+    const bool is_first = !(weight_ > 0.0);
+    if (is_first) weight_ = weight_of_row(row, state.nearest);
     for (int64_t c = 0; c < c_; ++c) {
-      rest_[c] = fit_.residual()[c];
+      const double *const by_pose = fit_.columns() + 6 * c, *const r = by_pose + 3;
+      rest_[c] = weight_ * fit_.residual()[c];
       for (int j = 0; j < 3; ++j) {
-        const double *const r = by_pose + 6 * c + 3;
-        columns_[c_ * j + c] = by_pose[6 * c + j];
-        columns_[c_ * (3 + j) + c] = r[0] * state.R[0][j] + r[1] * state.R[1][j] + r[2] * state.R[2][j];
+        H_[c][j] = weight_ * by_pose[j];
+        H_[c][3 + j] = weight_ * (r[0] * state.R[0][j] + r[1] * state.R[1][j] + r[2] * state.R[2][j]);
       }
+      for (int64_t e = 0; e < q_; ++e) H_[c][pose + e] = 0.0;
     }
-    for (int64_t e = 0; e < q_; ++e)
-      for (int64_t c = 0; c < c_; ++c) columns_[c_ * (pose + e) + c] = 0.0;
     for (int64_t k = 0; q_ && k < p_.fit->n_magnets; ++k) {
-      double *const of_magnet = of_magnet_;
-      fit_.read_magnet(channels_, state, k, strength_[k], of_magnet);
-      for (int64_t e = 0; e < q_; ++e)
-        for (int64_t c = 0; c < c_; ++c) columns_[c_ * (pose + e) + c] += p_.magnet_errors[q_ * k + e] * of_magnet[c];
-    }
-    for (int64_t e = 0; e < a_; ++e) {
-      const double *const effect = p_.sensor_errors + c_ * (a_ * row + e);
-      for (int64_t c = 0; c < c_; ++c) {
-        columns_[c_ * (pose + q_ + e) + c] = effect[c];
-        rest_[c] -= effect[c] * errors_[q_ + e];
+      fit_.read_magnet(channels_, state, k, strength_[k], of_magnet_);
+      for (int64_t e = 0; e < q_; ++e) {
+        const double factor = weight_ * p_.magnet_errors[q_ * k + e];
+        for (int64_t c = 0; c < c_; ++c) H_[c][pose + e] += factor * of_magnet_[c];
       }
     }
-    if (!(weight_ > 0.0)) weight_ = weight_of_row(row, state.nearest);
-    for (int64_t i = 0; i < d_ * c_; ++i) columns_[i] *= weight_;
-    double square = 0.0;
+    if (is_first) fill_sensor_errors(row);
+    for (int64_t c = 0; c < c_; ++c)
+      for (int64_t e = 0; e < a_; ++e) rest_[c] -= H_[c][p_states_ + e] * p_.errors[q_ + e];
+  }
+  void fill_sensor_errors(int64_t row) {
     for (int64_t c = 0; c < c_; ++c) {
-      rest_[c] *= weight_;
-      square += rest_[c] * rest_[c];
+      for (int64_t e = 0; e < a_; ++e) H_[c][p_states_ + e] = weight_ * p_.sensor_errors[c_ * (a_ * row + e) + c];
+      for (int64_t e = d_; e < H_.width() * n_lanes<Lanes>; ++e) H_[c][e] = 0.0;
+      set_rows(of_sensors_.lanes(c), {H_[c] + p_states_}, P_.from(p_states_), a_);
     }
-    return square;
   }
 
   // A pose that is uncertain bends the readings by their size times the square of the uncertainty, relative to the
@@ -223,95 +176,74 @@ class BodyFilter {
   bool update(int64_t row) {
     PoseState<double> state;
     PoseFit<double>::clear(state);
-    double turned[3] = {};
     for (int i = 0; i < 3; ++i) state.x[i] = p_.pose[i];
     for (int i = 0; i < 9; ++i) state.R[i / 3][i % 3] = p_.pose[3 + i];
-    for (int64_t e = 0; e < q_ + a_; ++e) errors_[e] = p_.errors[e];
-    for (int64_t i = 0; i < d_; ++i) {
-      error_[i] = 0.0;
-      for (int64_t j = 0; j < d_; ++j) prior_[i][j] = P_[i][j];
-    }
-    invert(prior_, scale_, column_);
-    double cost = infinity;
+    for (int64_t e = 0; e < q_; ++e) errors_[e] = p_.errors[e];
+    for (int64_t i = 0; i < p_states_; ++i) turned_[i] = 0.0;
+    for (int64_t c = 0; c < c_; ++c) multiplier_[c] = 0.0;
+    double square = infinity;
     weight_ = 0.0;
     for (int64_t iteration = 0; iteration < p_.max_iterations; ++iteration) {
-      cost = linearise(state, row);
-      for (int64_t i = 0; i < d_; ++i) {
-        double sum = 0.0, of_prior = 0.0;
-        for (int64_t c = 0; c < c_; ++c) sum += columns_[c_ * i + c] * rest_[c];
-        for (int64_t j = 0; j < d_; ++j) of_prior += prior_[i][j] * error_[j];
-        gradient_[i] = sum - of_prior;
-        cost += error_[i] * of_prior;
-        for (int64_t j = 0; j <= i; ++j) {
-          double product = prior_[i][j];
-          for (int64_t c = 0; c < c_; ++c) product += columns_[c_ * i + c] * columns_[c_ * j + c];
-          posterior_[i][j] = posterior_[j][i] = product;
-        }
-      }
-      invert(posterior_, scale_, column_);
-      double promised = 0.0;
-      for (int64_t i = 0; i < d_; ++i) {
-        step_[i] = 0.0;
-        for (int64_t j = 0; j < d_; ++j) step_[i] += posterior_[i][j] * gradient_[j];
-        promised += step_[i] * gradient_[i];
-      }
+      linearise(state, row);
+      const double promised = solve_row(square);
       if (!(promised < infinity)) return false;
+      double *const error = error_[0];
       double turn[3];
       for (int i = 0; i < 3; ++i) {
-        state.x[i] += step_[i];
-        turn[i] = step_[3 + i];
+        state.x[i] += error[i] - turned_[i];
+        turn[i] = error[3 + i] - turned_[3 + i];
       }
       turn_body(&state.R[0][0], turn);
-      for (int64_t i = 0; i < d_; ++i) error_[i] += step_[i];
+      for (int64_t e = 0; e < q_; ++e) errors_[e] = p_.errors[e] + error[pose + e];
       // The rotation from the prediction, of two rotations in succession to the second order.
-      for (int i = 0; i < 3; ++i) {
-        const int j = (i + 1) % 3, k = (i + 2) % 3;
-        error_[3 + i] += 0.5 * (turned[j] * turn[k] - turned[k] * turn[j]);
-      }
-      for (int i = 0; i < 3; ++i) turned[i] = error_[3 + i];
-      for (int64_t e = 0; e < q_ + a_; ++e) errors_[e] += step_[pose + e];
-      cost -= promised;
+      const double *const before = turned_ + 3;
+      const double mixed[3] = {before[1] * turn[2] - before[2] * turn[1], before[2] * turn[0] - before[0] * turn[2],
+                               before[0] * turn[1] - before[1] * turn[0]};
+      for (int64_t i = 0; i < p_states_; ++i) turned_[i] = error[i];
+      for (int i = 0; i < 3; ++i) turned_[3 + i] += 0.5 * mixed[i];
       if (promised < p_.tolerance) break;
     }
-    p_.nis[row] = cost;
-    if (!(cost < p_.nis_limits[row])) return false;
+    p_.nis[row] = square;
+    if (!(square < p_.nis_limits[row])) return false;
     for (int i = 0; i < 3; ++i) p_.pose[i] = state.x[i];
     for (int i = 0; i < 9; ++i) p_.pose[3 + i] = state.R[i / 3][i % 3];
-    for (int64_t e = 0; e < q_ + a_; ++e) p_.errors[e] = errors_[e];
-    regress_rates();
+    for (int64_t e = 0; e < q_ + a_; ++e) p_.errors[e] += error_[0][pose + e];
+    for (int64_t i = 0; i < rates; ++i) p_.rates[i] += error_[0][d_ + i];
+    solve_transposed(S_, c_, HP_);
+    for (int64_t i = 0; i < n_; ++i) add_rows(P_.lanes(i), -HP_.column(i), HP_, c_);
     return true;
   }
 
-  // Rates and the covariance after an update of the first d states, whose covariance was P and is the posterior.
-  void regress_rates() {
-    for (int64_t r = 0; r < rates; ++r) {
-      double *const gain = gain_ + d_ * r;
-      for (int64_t j = 0; j < d_; ++j) {
-        gain[j] = 0.0;
-        for (int64_t k = 0; k < d_; ++k) gain[j] += P_[d_ + r][k] * prior_[k][j];
-      }
-      for (int64_t j = 0; j < d_; ++j) p_.rates[r] += gain[j] * error_[j];
+  // Fill the error of the prediction that the readings show, and its normalised square. Return the square of the step
+  // from the last one, in standard deviations.
+  double solve_row(double &square) {
+    for (int64_t c = 0; c < c_; ++c) {
+      __builtin_memcpy(HP_[c], of_sensors_[c], HP_.width() * sizeof(Lanes));
+      add_rows(HP_.lanes(c), {H_[c]}, P_, p_states_);
     }
-    for (int64_t r = 0; r < rates; ++r) {
-      double *const lost = lost_;
-      for (int64_t j = 0; j < d_; ++j) {
-        double sum = 0.0;
-        for (int64_t k = 0; k < d_; ++k) sum += gain_[d_ * r + k] * posterior_[k][j];
-        lost[j] = P_[d_ + r][j] - sum;
-        moved_[d_ + r][j] = sum;
-      }
-      for (int64_t s = 0; s <= r; ++s) {
-        double sum = 0.0;
-        for (int64_t j = 0; j < d_; ++j) sum += lost[j] * gain_[d_ * s + j];
-        moved_[d_ + r][d_ + s] = P_[d_ + r][d_ + s] - sum;
-      }
+    double promised = 0.0;
+    for (int64_t c = 0; c < c_; ++c) {
+      double innovation = rest_[c];
+      for (int64_t i = 0; i < p_states_; ++i) innovation += H_[c][i] * turned_[i];
+      S_[c][c_] = ahead_[c] = innovation;
+      for (int64_t j = 0; j <= c; ++j)
+        S_[j][c] = S_[c][j] = double(c == j) + dot(H_.lanes(c), HP_.lanes(j), H_.width());
     }
-    for (int64_t i = 0; i < d_; ++i)
-      for (int64_t j = 0; j < d_; ++j) P_[i][j] = posterior_[i][j];
-    for (int64_t r = 0; r < rates; ++r) {
-      for (int64_t j = 0; j < d_; ++j) P_[d_ + r][j] = P_[j][d_ + r] = moved_[d_ + r][j];
-      for (int64_t s = 0; s <= r; ++s) P_[d_ + r][d_ + s] = P_[d_ + s][d_ + r] = moved_[d_ + r][d_ + s];
+    for (int64_t c = 0; c < c_; ++c) {
+      for (int64_t j = 0; j < c_; ++j) ahead_[c] -= S_[c][j] * multiplier_[j];
+      promised += ahead_[c] * ahead_[c];
     }
+    factorise(S_, c_);
+    solve_transposed(S_, c_, ahead_);
+    square = 0.0;
+    for (int64_t c = 0; c < c_; ++c) {
+      multiplier_[c] = S_[c][c_];
+      square += multiplier_[c] * multiplier_[c];
+      promised -= ahead_[c] * ahead_[c];
+    }
+    solve(S_, c_, multiplier_);
+    set_rows(error_.lanes(0), {multiplier_}, HP_, c_);
+    return promised;
   }
 };
 MAGLOC_END
