@@ -262,6 +262,17 @@ class MagnetBody:
         common = self.common_strength_sigma
         return np.column_stack([columns, np.full(len(own), common)]) if common else columns
 
+    @cached_property
+    def n_errors(self) -> int:
+        """Number of stated errors of the magnets, of moments, positions and directions."""
+        placed = (3 * bool(m.position_sigma_m) + 2 * bool(m.direction_sigma_rad) for m in self.magnets)
+        return self.moment_root.shape[1] + sum(placed)
+
+    def with_known_moments(self) -> MagnetBody:
+        """Return the body without errors of its moments."""
+        magnets = tuple(replace(magnet, moment_sigma_Am2=0.0) for magnet in self.magnets)
+        return replace(self, magnets=magnets, temperature_sigma_K=0.0)
+
     def without(self, index: int) -> tuple[Magnet, ...]:
         """Return all magnets but one; they may be a single one, which is no body."""
         return self.magnets[:index] + self.magnets[index + 1 :]

@@ -19,7 +19,7 @@ from arrays.typing import FloatArray
 from magloc import core
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.locator import BodyLocator
-from magloc.bodies.plausibility import warn_of_no_check
+from magloc.bodies.plausibility import n_checks, warn_of_no_check
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
 from magloc.bodies.search import fit_problem, packed, signals_of_rows, unpacked
 from magloc.bodies.track import BodyMotion, BodyTrack, TrackRows, joined_rows, judged, nearest_poses, placement_effects
@@ -58,9 +58,10 @@ class BodyTracker:
         self.locator = BodyLocator(array, body)
         self._errors = SensorErrors.of(array)
         self._white = without_lasting_errors(array) if self._errors.n_states else array
-        self._n_placement = sum(
-            3 * bool(magnet.position_sigma_m) + 2 * bool(magnet.direction_sigma_rad) for magnet in body.magnets
-        )
+        # Without a check of its rows, a track would learn the moments from the curvature of its own model.
+        is_checked = n_checks(array, self.locator.n_unknowns) >= 0.5
+        self.followed = body if is_checked else body.with_known_moments()
+        self._n_placement = body.n_errors - self.followed.moment_root.shape[1]
         self._last_s: float | None = None
         self._recent = np.zeros((0, 2))
         self._located_pose, self._located_step = (np.full(3, np.nan), np.eye(3)), math.nan
@@ -123,7 +124,7 @@ class BodyTracker:
 
     def _state_of(self, model: WhitenedModel, position_m: FloatArray, R: FloatArray, covariance: FloatArray) -> _State:
         """Return the state of a fix, whose row is used again, with unknown rates."""
-        q, a = self.body.moment_root.shape[1], self._errors.n_states
+        q, a = self.followed.moment_root.shape[1], self._errors.n_states
         n_errors = q + a + self._n_placement
         n = _POSE + n_errors + _RATES
         P = np.zeros((n, n))
@@ -146,16 +147,16 @@ class BodyTracker:
             of_rows = ("sensor_errors", "lasting", "added", "steps", "nis_limits", "curvature")
             of_state = ("pose", "rates", "errors", "covariance", "progress")
             results = ("poses", "all_rates", "covariances", "nis", "status")
-            fit = fit_problem(model, self.body, None, None, _MAX_ITERATIONS)
+            fit = fit_problem(model, self.followed, None, None, _MAX_ITERATIONS)
             track = core.problem(
                 "pose_track",
                 fit=fit,
-                n_magnet_errors=self.body.moment_root.shape[1],
+                n_magnet_errors=self.followed.moment_root.shape[1],
                 n_sensor_errors=self._errors.n_states + self._n_placement,
                 max_iterations=_MAX_ITERATIONS,
                 most_contradictions=MOST_CONTRADICTIONS,
                 tolerance=_TOLERANCE,
-                magnet_errors=np.ascontiguousarray(self.body.moment_root),
+                magnet_errors=np.ascontiguousarray(self.followed.moment_root),
                 **dict.fromkeys(of_rows + of_state + results),
             )
             self._problems = fit, track
@@ -174,7 +175,7 @@ class BodyTracker:
         if self._n_placement and len(values):
             poses = self._located(values, ambient_T, time_s)
             effects = [
-                np.concatenate([one, placement_effects(self.body, group, *poses)], axis=1)
+                np.concatenate([one, placement_effects(self.body, self._n_placement, group, *poses)], axis=1)
                 for one, group in zip(effects, groups, strict=True)
             ]
         if len(groups) == 1:
@@ -361,7 +362,7 @@ class _TrackProblem:
                 at,
                 self.rows.model.rows(index),
                 self.rows.y[index],
-                self.tracker.body,
+                self.tracker.followed,
                 self.rows.effects[row + i],
                 curvature=float(curvature[i]),
                 max_iterations=_MAX_ITERATIONS,

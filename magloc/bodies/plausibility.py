@@ -75,13 +75,19 @@ def warn_of_inside(array: SensorArray, body: MagnetBody, poses: BodyPoses) -> No
         )
 
 
+def n_checks(array: SensorArray, n_unknowns: int) -> float:
+    """Return how many readings of a row are left to check a pose, a known common field among them."""
+    common_T = array.common_field_T
+    noise_T = float(np.median(array.channel_noise_T))
+    known = 0.0 if common_T is None else 3.0 / (1.0 + array.n_sensors * (common_T / noise_T) ** 2)
+    return array.n_channels - 3 - n_unknowns + known
+
+
 def warn_of_no_check(array: SensorArray, n_unknowns: int) -> None:
     """Warn of an array whose readings are as many as the unknowns of a pose, so that χ² shows no error."""
     common_T = array.common_field_T
     noise_T = float(np.median(array.channel_noise_T))
-    known = 0.0 if common_T is None else 3.0 / (1.0 + array.n_sensors * (common_T / noise_T) ** 2)
-    left = array.n_channels - 3 - n_unknowns + known
-    if -0.5 < left < 0.5:
+    if -0.5 < n_checks(array, n_unknowns) < 0.5:
         stated = "none is stated" if common_T is None else f"{1e9 * common_T:.3g} nT are stated"
         _LOG.warning(
             f"{array.n_channels} readings leave no check of a pose: six are its own, three those of the common field,"

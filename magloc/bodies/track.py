@@ -141,13 +141,15 @@ def nearest_poses(poses: BodyPoses, position_m: FloatArray, R: FloatArray) -> tu
     return np.array(places), np.array(turns)
 
 
-def placement_effects(body: MagnetBody, group: WhitenedRows, position_m: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the whitened readings (b, e, C) of stated errors of positions and directions, at poses of all rows.
+def placement_effects(
+    body: MagnetBody, n: int, group: WhitenedRows, position_m: FloatArray, R: FloatArray
+) -> FloatArray:
+    """Return the whitened readings (b, n, C) of the last n stated errors of the magnets, at poses of all rows.
 
     They are zero without a pose.
     """
     *_, errors = linearise(group.model, body, position_m[group.index], R[group.index])
-    of_places = group.model.whiten(np.nan_to_num(errors[..., body.moment_root.shape[1] :]))
+    of_places = group.model.whiten(np.nan_to_num(errors[..., errors.shape[-1] - n :]))
     return np.ascontiguousarray(of_places.transpose(0, 2, 1))
 
 

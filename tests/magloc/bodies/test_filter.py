@@ -106,6 +106,21 @@ def test_errors_of_magnets_and_sensors_are_estimated() -> None:
     assert 0.4 < np.mean(squares) < 2.0
 
 
+def test_three_sensors_do_not_learn_the_moments_from_rows_without_a_check() -> None:
+    # Nine readings less three of the common field are as many as a pose has numbers.
+    rng = np.random.default_rng(60_24)
+    array, body = hall_ring(), knob(moment_sigma_Am2=0.0005)
+    squares = []
+    for seed in range(8):
+        scales = 1.0 + 0.01 * rng.normal(size=3)
+        moments = [tuple(s * np.array(m.moment_Am2)) for s, m in zip(scales, body.magnets, strict=True)]
+        true = replace(body, magnets=[replace(m, moment_Am2=new) for m, new in zip(body.magnets, moments, strict=True)])
+        readings, position_m, R = record(array, true, 300, 60_40 + seed)
+        squares.append(np.nanmean(nees(track_body(array, body, readings), position_m, R)))
+    # Eight devices, as above: within 0.4 to 2.
+    assert 0.4 < np.mean(squares) < 2.0
+
+
 def test_a_gap_and_a_missing_sensor_do_not_end_a_track() -> None:
     array, body = hall_ring(4), knob()
     readings, position_m, R = record(array, body, 200, 60_24)
