@@ -23,7 +23,7 @@ from magloc.navigation.flight_lines import flight_lines
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.fit.sensor_order import exchanged_beside, size_of_anomalies, weaker_sensors_below
 from magloc.surveying.piece import Ground
-from magloc.surveying.preparation import FEWEST_ROWS, field_moduli, unusable_readings, without_ambient
+from magloc.surveying.preparation import FEWEST_ROWS, earlier_rows, field_moduli, unusable_readings, without_ambient
 from magloc.terrain.surface import Terrain
 
 _LEAST_LEVEL = 0.2  # least horizontal share of the ambient field: near the poles it is small
@@ -72,6 +72,7 @@ def check_quality(
         raise ValueError(f"Input readings must have {FEWEST_ROWS} rows or more; instead received {len(rows)}.")
     check_order(rows)
     check_magnitudes(array)
+    earlier = earlier_rows(rows)
     fixes = between_fixes(rows.time_s, rows.array_position_m, rows.array_rotation)
     held = 0.0 if fixes is None else fixes.held / len(rows)
     if fixes is not None:
@@ -81,7 +82,7 @@ def check_quality(
     terrain = ground_m if isinstance(ground_m, Terrain) else Terrain(ground_m)
     ground = Ground(NOTHING_KNOWN, terrain, _SHORTEST_GEOLOGY_M, math.inf)
     read_T, rows = field_moduli(array, rows.values_T), without_saturated(rows, array)
-    stuck, spikes, unusable = unusable_readings(array, rows, ground.shallowest_m, terrain)
+    stuck, spikes, clipped, unusable = unusable_readings(array, rows, ground.shallowest_m, terrain)
     moduli_T = np.where(unusable, np.nan, read_T)
     height_m = -terrain.depth_of(place_m)
     lines = flight_lines(rows.time_s, place_m, height_m, rows.lines)
@@ -100,7 +101,7 @@ def check_quality(
         _gaps(rows.time_s, place_m),
         lines,
         _fourth_differences(rows.time_s, moduli_T),
-        unusable & ~stuck & ~spikes,
+        unusable & ~stuck & ~spikes & ~clipped,
         stuck,
         spikes,
         [heading_error(place_m[:, :2], column, lines) for column in variations_T.T],
@@ -114,6 +115,8 @@ def check_quality(
         anomalies_T,
         weaker_sensors_below(array, whole, anomalies_T),
         exchanged_beside(array, rows, variations_T, lines) or (),
+        clipped,
+        earlier,
     )
 
 

@@ -18,7 +18,7 @@ from arrays.io.tables import align
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.deliverables.coverage import Coverage
 from magloc.deliverables.heading import HeadingError
-from magloc.measurement.plausibility import EARTH_T, robust_sigma
+from magloc.measurement.plausibility import EARTH_T, alternates, robust_sigma
 from magloc.navigation.crossovers import ClockShift
 from magloc.navigation.flight_lines import FlightLine
 from magloc.surveying.clock import ClockLag
@@ -95,6 +95,10 @@ class Quality(Result):
         decays upwards.
     exchanged : tuple of str
         Two sensors beside each other that appear exchanged, or none.
+    clipped : ndarray of bool, shape (n, N)
+        Readings that repeat the largest or smallest one, which a survey leaves out as well.
+    earlier : ndarray of int, shape (n,)
+        The earlier row that each row repeats in a block, or -1.
 
     Examples
     --------
@@ -133,6 +137,8 @@ class Quality(Result):
     anomalies_T: FloatArray = field(default_factory=lambda: np.zeros(0))
     weaker_below: tuple[str, ...] = ()
     exchanged: tuple[str, ...] = ()
+    clipped: BoolArray = field(default_factory=lambda: np.zeros((1, 0), np.bool_))
+    earlier: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def interval_s(self) -> float:
@@ -169,6 +175,10 @@ class Quality(Result):
             return Check(name, "", value, unit, remark)
 
         yield check("rows", len(self.time_s), "")
+        again = np.flatnonzero(self.earlier >= 0)
+        if again.size:
+            now_s, then_s = self.time_s[[again[0], self.earlier[again[0]]]]
+            yield check("repeated rows", again.size, "", f"those from {now_s:.10g} s equal those from {then_s:.10g} s")
         yield check("duration", float(np.ptp(self.time_s)), "s")
         yield check("rate", 1.0 / self.interval_s, "Hz")
         share = self.jitter_s / self.interval_s
@@ -232,6 +242,7 @@ class Quality(Result):
             stated_T = float(white_noise_T(self.array)[self.array.channel_sensor == i].max())
             noise_T = float(self.noise_T[i])
             times = f"{noise_T / stated_T:.1f} times the stated noise: noise_nT = {1e9 * noise_T:.2g}"
+            times = "two levels in turn: two instruments in one column?" if alternates(self.fourth_T[:, i]) else times
             remark = times if noise_T > NOISY * stated_T else ""
             yield Check("noise", sensor.id, 1e9 * noise_T, "nT", remark)
             lower = self.weaker_below[i]
@@ -243,6 +254,7 @@ class Quality(Result):
                 ("missing", self.missing, _MISSING),
                 ("stuck", self.stuck, 0.0),
                 ("spikes", self.spikes, _SPIKES),
+                *([("clipped", self.clipped, 0.0)] if self.clipped.any() else []),
             ):
                 share = float(which[:, i].mean())
                 remark = f"{which[:, i].sum()} readings" if share > most else ""

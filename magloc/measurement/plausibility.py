@@ -33,6 +33,8 @@ _OF_A_NANOTESLA = {"µT": 1e-3, "G": 1e-5, "T": 1e-9}
 _LIKE = 3.0  # largest factor between the measured noise and the stated noise in another unit
 _WHITE = 5.0  # growth from lag 1 to lag 2: 1 for white noise, 8 after a filter of second order, 2**6 for smooth fields
 _OTHER_UNIT = 5.0  # ratio of moduli to the ambient field; a source near the sensors is not so strong for long
+_ALTERNATES = 0.15  # sum of successive differences relative to each, in a reading with two levels
+_OF_STEP = 0.6745 * math.sqrt(924.0) / 2.0**5  # step between two levels, relative to robust σ of sixth differences
 _STEADY = 0.02  # largest relative change of the modulus of the Earth's field
 _TURNS_RAD = 0.06  # three times the effect of attitude errors of 1° and of a source
 _TURNS_UNEXPLAINED_RAD = 0.3  # offsets of 10 µT in 50 µT cause 0.2
@@ -117,10 +119,9 @@ def record_doubts(array: SensorArray, readings: Readings, used: Readings | None 
                 f"the readings change from row to row by {noise:.1g} times the stated noise, as they would in {unit}:"
                 " are they in nT, is noise_nT right, were they filtered?"
             )
+    yield from _alternation_doubts(array, used.values_T)
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
-    of_unit = list(
-        _moduli_doubts(used.values_T[:, array.channel_is_scalar], finite_median(np.linalg.norm(ambient_T, axis=-1)))
-    )
+    of_unit = list(_moduli_doubts(array, used.values_T, finite_median(np.linalg.norm(ambient_T, axis=-1))))
     yield from of_unit or _ambient_doubts(array, used)
     if used.pose is not None:
         yield from _path_doubts(used.time_s, used.pose[0])
@@ -220,16 +221,40 @@ def _sixth_difference(values: FloatArray, lag: int) -> FloatArray:
     return values / np.sqrt(924.0)  # 1² + 6² + 15² + 20² + 15² + 6² + 1²
 
 
-def _moduli_doubts(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
+def alternates(differences: FloatArray) -> bool:
+    """Return whether high differences (n,) of readings only change their sign from row to row.
+
+    The sum of successive differences of white noise is half as large as the differences themselves.
+    """
+    return robust_sigma(differences[1:] + differences[:-1]) < _ALTERNATES * robust_sigma(differences)
+
+
+def _alternation_doubts(array: SensorArray, values_T: FloatArray) -> Iterator[str]:
+    """Yield a sentence if readings alternate between two levels."""
+    differences = _sixth_difference(values_T, 1)
+    for name, noise_T, own in zip(array.channel_names, array.channel_noise_T, differences.T, strict=True):
+        if alternates(own) and robust_sigma(own) > _OTHER_UNIT * noise_T:
+            # An alternating reading of ± 1 has a sixth difference of 2⁶, which √924 divides.
+            yield (
+                f"the readings of {name} alternate from row to row by {1e9 * robust_sigma(own) * _OF_STEP:.3g} nT: are"
+                " two instruments in one column, or is it mains hum at half the rate of the rows?"
+            )
+
+
+def _moduli_doubts(array: SensorArray, values_T: FloatArray, ambient_T: float) -> Iterator[str]:
     """Yield a sentence if scalar sensors do not read about the ambient field.
 
     Values of both signs are residuals after the field was subtracted.
     """
-    read = finite_median(moduli_T)
-    unlike = read < ambient_T / _OTHER_UNIT or read > ambient_T * _OTHER_UNIT
-    if ambient_T > 0.0 and unlike and not (moduli_T < 0.0).any():
+    moduli_T = values_T[:, array.channel_is_scalar]
+    each_T = np.array([finite_median(column) for column in moduli_T.T])
+    unlike = (each_T < ambient_T / _OTHER_UNIT) | (each_T > ambient_T * _OTHER_UNIT)
+    if ambient_T > 0.0 and unlike.any() and not (moduli_T < 0.0).any():
+        read = finite_median(each_T[unlike])
+        ids = (array.ids[i] for i in array.channel_sensor[array.channel_is_scalar][unlike])
+        which = "scalar sensors read" if unlike.all() else f"of the scalar sensors, {', '.join(ids)} read"
         yield (
-            f"scalar sensors read {1e9 * read:.4g} nT in the median where the ambient field is {1e9 * ambient_T:.4g}"
+            f"{which} {1e9 * read:.4g} nT in the median where the ambient field is {1e9 * ambient_T:.4g}"
             " nT: are both in nT, or was it subtracted from the readings?"
         )
 

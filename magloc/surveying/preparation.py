@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from arrays.array import SensorArray
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.measurement.rows import check_magnitudes, check_order
 from magloc.measurement.screening import wild_readings
@@ -38,6 +38,10 @@ _LONGEST_RUN = 25  # equal readings in a run, relative to the mean run of the be
 _LEAST_DIGIT_T = 1e-14  # smaller steps are rounding errors
 _STILL, _LAST_DIGITS = 50, 2.0  # rows within so many steps of the last digit, although the noise is larger
 _STILL_ALONE, _OTHERS = 200, 100.0  # the same, although another sensor changes by so many steps
+_CUT_RUN, _FEWEST_CUT, _MOST_CUT = 3, 5, 0.25  # rows of a run of clipped readings, of all such runs, and their share
+_FEWEST_RUNS = 2  # a carrier that stops at a peak makes one
+_CUT_STEP = 4.0  # least step beside such a run, in steps of the last digit; at a rounded peak it is 2
+_CUT_RUNS, _PILED, _SMALL_STEP = 3, 5.0, 1.5  # or this step, with so many runs and more rows than the next values have
 
 
 def whole_rows(
@@ -56,7 +60,7 @@ def whole_rows(
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     check_magnitudes(array)
     readings = without_saturated(readings, array)
-    stuck, wild, missing = unusable_readings(array, readings, shallowest_m, terrain)
+    stuck, wild, clipped, missing = unusable_readings(array, readings, shallowest_m, terrain)
     order = np.argsort(missing.sum(axis=0), kind="stable")
     worth = [(i + 1) * int((~missing[:, order[: i + 1]].any(axis=1)).sum()) for i in range(len(order))]
     kept = np.sort(order[: len(worth) - int(np.argmax(worth[::-1]))])
@@ -72,12 +76,26 @@ def whole_rows(
     if (counts := wild[:, kept].sum(axis=0)).any():
         each = ", ".join(f"{n} of sensor {array.sensors[i].id}" for i, n in zip(kept, counts, strict=True) if n)
         _LOG.warning(f"spikes in the readings: {counts.sum()} in all, {each}; their rows are ignored")
+    for i, sensor in enumerate(array.sensors):
+        if clipped[:, i].any():
+            _LOG.warning(
+                f"{clipped[:, i].sum()} readings of sensor {sensor.id} repeat its largest or smallest reading exactly,"
+                " as if they were clipped; they are ignored. State saturation_nT"
+            )
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
     if len(kept) < array.n_sensors:
         readings = replace(readings, values_T=readings.values_T[:, np.isin(array.channel_sensor, kept)])
     readings = _some(readings, whole)
     check_order(readings)
+    earlier = earlier_rows(readings)
+    if (again := earlier >= 0).any():
+        k = int(again.argmax())
+        _LOG.warning(
+            f"{again.sum()} rows repeat earlier ones with new times, those from {readings.time_s[k]:.10g} s those from"
+            f" {readings.time_s[earlier[k]]:.10g} s: they are ignored"
+        )
+        readings = _some(readings, ~again)
     readings = _some(readings, ~leaping_rows(readings))
     readings = _some(readings, ~rows_without_attitude(array, readings))
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
@@ -115,8 +133,8 @@ def _some(readings: Readings, which: BoolArray) -> Readings:
 
 def unusable_readings(
     array: SensorArray, readings: Readings, shallowest_m: float, terrain: Terrain
-) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Return readings (n, N) that are stuck, spikes, and all unusable readings; they need a pose."""
+) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
+    """Return readings (n, N) that are stuck, spikes, clipped, and all unusable readings; they need a pose."""
     assert readings.array_position_m is not None
     assert readings.array_rotation is not None
     blocks = [readings.values_T[first : first + _BLOCK] for first in range(0, max(len(readings), 1), _BLOCK)]
@@ -130,7 +148,9 @@ def unusable_readings(
         depth_m = max(float(np.quantile(terrain.flatten(place_m)[:, 2], _LOWEST)) - shallowest_m, _LEAST_DEPTH_M)
         noise_T = float(white_noise_T(array)[array.channel_sensor == i].max())
         wild[:, i] = wild_readings(moduli[:, i], place_m, depth_m, noise_T, jitter_m)
-    return stuck, wild, np.asarray(np.isnan(moduli) | wild)
+    left_out = np.asarray(np.isnan(moduli) | wild)
+    clipped = clipped_readings(array, np.where(left_out[:, array.channel_sensor], np.nan, readings.values_T))
+    return stuck, wild, clipped, left_out | clipped
 
 
 def field_moduli(array: SensorArray, values: FloatArray) -> FloatArray:
@@ -168,6 +188,34 @@ def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
     least = min(typical, default=math.inf)
     runs = lengths > _LONGEST_RUN * (1.0 if least >= n else least)  # a log of one reading shows no field
     return np.asarray(runs | _still_readings(array, values))
+
+
+def clipped_readings(array: SensorArray, values: FloatArray) -> BoolArray:
+    """Return readings (n, N) of sensors that repeat the largest or smallest value of a channel in runs.
+
+    Beside a run of clipped readings the readings change by many steps of the last digit. At the peak of a rounded
+    curve, and while a sensor is at rest, they change by one or two.
+    """
+    out = np.zeros((len(values), array.n_sensors), np.bool_)
+    for owner, column in zip(array.channel_sensor, values.T, strict=True):
+        known = np.flatnonzero(np.isfinite(column))
+        read = column[known]
+        steps = np.abs(np.diff(read))
+        digit = np.min(steps, where=steps > _LEAST_DIGIT_T, initial=math.inf)
+        for level in (read.max(initial=-math.inf), read.min(initial=math.inf)):
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], read == level, [False]])))
+            begins, ends = edges.reshape(-1, 2).T
+            long = ends - begins >= _CUT_RUN
+            begins, ends = begins[long], ends[long]
+            beside = np.concatenate([steps[begins[begins > 0] - 1], steps[ends[ends < len(read)] - 1]])
+            number = int((ends - begins).sum())
+            if len(begins) < _FEWEST_RUNS or not _FEWEST_CUT <= number < _MOST_CUT * len(read):
+                continue
+            step, away = float(np.median(beside)) / digit, np.rint(np.abs(read - level) / digit)
+            is_pile = len(begins) >= _CUT_RUNS and number > _PILED * max(np.sum(away == k) for k in (1, 2, 3))
+            if step > _CUT_STEP or (is_pile and step > _SMALL_STEP):
+                out[known[read == level], owner] = True
+    return out
 
 
 def _still_readings(array: SensorArray, values: FloatArray) -> BoolArray:
@@ -213,6 +261,23 @@ def variations_of_lines(array: SensorArray, rows: Readings) -> tuple[FloatArray,
     assert place_m is not None
     variations_T = without_ambient(rows, field_moduli(array, rows.values_T))
     return variations_T, flight_lines(rows.time_s, place_m, place_m[:, 2], rows.lines)
+
+
+def earlier_rows(readings: Readings) -> IntArray:
+    """Return for each row (n,) the earlier row that it repeats within a moving block of twenty or more; -1 if none.
+
+    Places and readings are equal to the last digit. A carrier at rest may repeat a row by chance.
+    """
+    assert readings.array_position_m is not None
+    numbers = np.nan_to_num(np.column_stack([1e9 * readings.values_T, readings.array_position_m]))
+    key = numbers @ np.sqrt(1.0 + np.arange(1.0, numbers.shape[1] + 1.0))
+    _, first, of = np.unique(key, return_index=True, return_inverse=True)
+    back = np.arange(len(key)) - first[of]
+    run = np.cumsum(np.diff(back, prepend=-1) != 0) - 1
+    way_m = np.linalg.norm(np.diff(readings.array_position_m, axis=0, prepend=np.nan), axis=1)
+    way_m[np.diff(run, prepend=-1) != 0] = 0.0
+    is_block = (np.bincount(run) >= FEWEST_ROWS) & (np.bincount(run, way_m) > 0.0)
+    return np.where((back > 0) & is_block[run], first[of], -1)
 
 
 def leaping_rows(readings: Readings) -> BoolArray:

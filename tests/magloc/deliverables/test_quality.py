@@ -299,6 +299,27 @@ class TestFaultyReadings:
         assert "stuck" in quality.flags
 
     @pytest.mark.usefixtures("without_lag")
+    def test_clipped_ones(self) -> None:
+        quality = checked(lambda values: np.minimum(values, np.quantile(values[:, 0], 0.97)))
+        assert value(quality, "clipped", "low") == pytest.approx(3.0, abs=0.1)
+        assert not quality.clipped[:, 1].any()
+        assert quality.flags == ["clipped"]
+
+    @pytest.mark.usefixtures("without_lag")
+    def test_two_instruments_in_one_column(self) -> None:
+        quality = checked(lambda values: values + 6e-8 * (np.arange(len(values)) % 2)[:, None])
+        remarks = [check.remark for check in quality.checks if check.name == "noise"]
+        assert remarks == ["two levels in turn: two instruments in one column?"] * 2
+
+    @pytest.mark.usefixtures("without_lag")
+    def test_a_block_twice(self) -> None:
+        which = np.r_[:400, 300 : len(ROWS)]
+        twice = replace(ROWS[which], time_s=np.arange(len(which)) / RATE_Hz)
+        quality = magloc.check_quality(PAIR, twice)
+        assert value(quality, "repeated rows") == 100
+        assert "repeated rows" in quality.flags
+
+    @pytest.mark.usefixtures("without_lag")
     def test_all_digits_are_coarse(self) -> None:
         """1 nT, ten times the noise: neighbouring readings are often equal, and no sensor is stuck."""
         quality = checked(lambda values: 1e-9 * np.round(values / 1e-9))

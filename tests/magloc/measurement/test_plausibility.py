@@ -26,6 +26,7 @@ from arrays.geometries import axial, cube, grid, tetrahedron
 from arrays.typing import FloatArray
 from magloc.measurement.plausibility import array_doubts, doubts, moment_doubts, noise_ratio
 from magloc.readings import Readings
+from tests.hills import PAIR, plain, walk
 from tests.passing_source import ARRAY, moving_source, readings_of
 
 DATASETS = ("board", "diver", "drone", "ship")
@@ -128,6 +129,20 @@ class TestUnit:
     def test_picotesla_where_sensors_saturate(self, name: str) -> None:
         """Others are misfits: tests/magloc/tracking/test_broken_assumptions.py."""
         assert "reach saturation_nT" in sentences(name, in_picotesla)
+
+    def test_one_sensor_in_microtesla(self) -> None:
+        rows = walk(71, plain, 5.0, 3).readings
+        one = replace(rows, values_T=rows.values_T * [1.0, 1e-3])
+        assert "of the scalar sensors, high read 48.3" in " ".join(doubts(PAIR, one))
+
+    def test_two_instruments_in_one_column(self) -> None:
+        """Rows in turn, 60 nT apart. Of 60 simulated surveys, none had such a sentence."""
+        rows = walk(71, plain, 5.0, 3).readings
+        mixed = rows.values_T + 6e-8 * (np.arange(len(rows)) % 2)[:, None]
+        words = " ".join(doubts(PAIR, replace(rows, values_T=mixed)))
+        for sensor in PAIR.ids:
+            assert f"the readings of {sensor} alternate from row to row by 60 nT" in words
+        assert "alternate" not in " ".join(doubts(PAIR, rows))
 
     def test_moduli_beside_their_ambient_field(self) -> None:
         assert "the ambient field is 4.88e+04 nT" in sentences("drone", in_microtesla)
