@@ -241,7 +241,7 @@ class SourcesTracker:
         array = self.scene.array
         sigma_T = array.common_field_T
         if sigma_T is None:
-            largest = np.nanmax(np.abs(problem.row.readings_T - array.channel_offset_T))
+            largest = np.nanmax(np.abs(problem.row.readings_T - array.channel_offset_T), initial=0.0)
             sigma_T = 3.0 * float(largest) + 100.0 * float(array.channel_noise_T.max())
         return Hypothesis(
             JointState.empty(np.zeros(3), sigma_T, problem.joint_row.centroid_m, array.circumradius),

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import magloc
 from arrays.io.errors import InputError
+from arrays.io.tables import by_sigma
 from magloc.tracking.files import at_rest
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.rows import rows_of
@@ -172,7 +173,7 @@ class TestSourceAtRest:
         assert len(found["moment_Am2"]) == len(found["sigma_moment_Am2"]) == 3
         kml = track.to_kml(self.PLACE)
         assert kml.count("<Placemark>") == kml.count("<Point>") == 1
-        assert f"{found['depth_m']:.2f} ± {sigma[2]:.2g} m below the origin" in kml
+        assert f"{' ± '.join(by_sigma(found['depth_m'], sigma[2]))} m below the origin" in kml
 
     def test_one_that_moves(self, track: magloc.Track) -> None:
         assert at_rest(track) is None
