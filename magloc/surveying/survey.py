@@ -29,6 +29,7 @@ from magloc.surveying.piece import Ground, significant_sources, strongest_source
 from magloc.surveying.preparation import variations_of_lines, whole_rows, with_places_between_fixes
 from magloc.surveying.results import Survey
 from magloc.surveying.review.state import SurveyState
+from magloc.surveying.review.wrong_positions import doubt_of_positions
 from magloc.surveying.tiled import Tell, TiledSurvey
 from magloc.terrain.surface import Terrain
 
@@ -171,6 +172,8 @@ def survey(
                 f"{len(due)} of {len(tiled.tiles)} tiles differ from their neighbours in the sources at their edges"
             )
         found = SurveyState(tiled, assumed, lag.s if lag.is_significant else 0.0).measure(each, tell)
+        if doubt := doubt_of_positions(found, tiled, each):
+            _LOG.warning(doubt)
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
     return replace(found, seconds=time.monotonic() - began)
