@@ -292,7 +292,7 @@ def table_of_text(
     if wrong and (not line_numbers or len(cells) > len(header)):
         raise InputError(wrong)
     if wrong:
-        _LOG.warning(f"{name}: the last row is incomplete and is ignored")
+        _LOG.warning(f"{name}: the last row is incomplete and is left out")
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
     table = np.array(values).reshape(len(line_numbers), len(chosen))

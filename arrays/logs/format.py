@@ -165,7 +165,7 @@ class LogFormat:
             unusable = ~np.isin(logged.values[:, index[columns.valid.column]], columns.valid.equals)
             if unusable.any() and is_file:
                 fault = f"{columns.valid.column} that is not {' or '.join(map('{:g}'.format, columns.valid.equals))}"
-                _LOG.warning(f"{logged.path}: the readings of {unusable.sum()} rows have {fault} and are ignored")
+                _LOG.warning(f"{logged.path}: the readings of {unusable.sum()} rows have {fault} and are left out")
         readings = {name: np.where(unusable, np.nan, columns.unit_nT * found[name]) for name in own & found.keys()}
         found |= {name: np.where(found[name] == DUMMY, DUMMY, of) for name, of in readings.items()}
         label = columns.line or LINE
@@ -312,7 +312,7 @@ def without_dummies(
     if found:
         total = sum(found.values())
         each = ", ".join(f"{count} {where}" for where, count in found.items())
-        words = f"{table.path}: dummy values are ignored: {total} in all, {each}"
+        words = f"{table.path}: dummy values are left out: {total} in all, {each}"
         if name is None:
             _LOG.warning(words)
         else:

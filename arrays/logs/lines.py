@@ -86,12 +86,12 @@ def header_and_rows(
     ):
         if pattern and any(word in rows for word in words):  # the search for a text is far faster than for a pattern
             rows, n = re.subn(rf"^[ \t]*(?:{pattern}).*", "", rows, flags=re.MULTILINE)
-            found += [f"{n} lines of {called} are ignored"] * (n > 0)
+            found += [f"{n} lines of {called} are left out"] * (n > 0)
     _refuse_another_header(rows, name, first, columns, wanted)
     below = re.search(r"^.*\S.*$", rows, flags=re.MULTILINE)
     if line and below is not None and _are_units(cells_of(below[0], columns), header, is_time):
         rows = rows[: below.start()] + rows[below.end() :]
-        found.append("the row of units below it is ignored")
+        found.append("the row of units below it is left out")
     if not rows.strip():
         raise InputError(f"{name}, line {number}: found a header without rows, expected a row below it.")
     if found and not quiet:

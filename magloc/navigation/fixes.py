@@ -94,7 +94,7 @@ def without_gaps(table: Table) -> tuple[Table, FloatArray | None]:
         if len(fixes) > 1:
             error_m = np.maximum(error_m, _errors_m(place[:, [at.index(each) for each in columns]], time_s, fixes))
     found = [f"{(inside & ~whole).sum()} are interpolated"] * bool((inside & ~whole).any())
-    found += [f"{(~inside).sum()} before the first or after the last one are ignored"] * bool((~inside).any())
+    found += [f"{(~inside).sum()} before the first or after the last one are left out"] * bool((~inside).any())
     _LOG.warning(f"{table.path}: {(~whole).sum()} of {len(time_s)} rows have no complete place: {', '.join(found)}")
     table = replace(table, values=values[inside], line_numbers=table.line_numbers[inside])
     return table, error_m[inside] if (inside & ~whole).any() else None

@@ -32,7 +32,7 @@ _SETTLING = 8  # most repetitions of the search for a lag
 _MISFIT = 2.0  # largest χ² per reading of sources that show a lag: otherwise it imitates another error
 _FEWEST_LINES = 4  # from whose differences the error of a lag follows
 _OWN = 0.9  # largest share of the curvature by one line: the others would not determine a lag
-_AGREE, _SIGNIFICANT = 3.0, 4.0  # standard deviations of the difference of two estimates, and of a lag
+_AGREE, _SIGNIFICANT = 2.0, 4.0  # standard deviations of the difference of two estimates, and of a lag
 _ROWS = 6  # rows per knot of a smooth track
 
 
@@ -75,11 +75,15 @@ def agreed_lag(lines: ClockLag, targets: ClockLag) -> ClockLag:
     of the targets certain of a wrong lag. The lines need no model.
     """
     if not math.isfinite(lines.sigma_s):
-        return targets
+        alone = "the targets alone show it, opposite lines do not determine a lag" if targets.is_significant else ""
+        return targets._replace(doubt=alone)
     if not math.isfinite(targets.sigma_s):
         return lines
     if abs(targets.s - lines.s) < _AGREE * math.hypot(targets.sigma_s, lines.sigma_s):
-        return min(targets, lines, key=lambda lag: lag.sigma_s)
+        if lines.sigma_s < targets.sigma_s:
+            return lines
+        alone = f"the targets alone show it, opposite lines give {lines.s:.3f} ± {lines.sigma_s:.3f} s"
+        return targets._replace(doubt=alone if targets.is_significant and not lines.is_significant else "")
     doubt = f"the targets show {targets.s:.3f} ± {targets.sigma_s:.3f} s, opposite lines {lines.s:.3f}"
     return lines._replace(doubt=f"{doubt} ± {lines.sigma_s:.3f} s")
 

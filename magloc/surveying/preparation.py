@@ -68,19 +68,19 @@ def whole_rows(
     for i, sensor in enumerate(array.sensors):
         if i not in kept:
             why = "is stuck" if stuck[:, i].any() else "lacks readings"
-            _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is excluded")
+            _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is left out")
         elif stuck[:, i].any():
             _LOG.warning(
-                f"sensor {sensor.id} is stuck in {stuck[:, i].sum()} of {len(missing)} rows, which are ignored"
+                f"sensor {sensor.id} is stuck in {stuck[:, i].sum()} of {len(missing)} rows, which are left out"
             )
     if (counts := wild[:, kept].sum(axis=0)).any():
         each = ", ".join(f"{n} of sensor {array.sensors[i].id}" for i, n in zip(kept, counts, strict=True) if n)
-        _LOG.warning(f"spikes in the readings: {counts.sum()} in all, {each}; their rows are ignored")
+        _LOG.warning(f"spikes in the readings: {counts.sum()} in all, {each}; their rows are left out")
     for i, sensor in enumerate(array.sensors):
         if clipped[:, i].any():
             _LOG.warning(
                 f"{clipped[:, i].sum()} readings of sensor {sensor.id} repeat its largest or smallest reading exactly,"
-                " as if they were clipped; they are ignored. State saturation_nT"
+                " as if they were clipped; they are left out. State saturation_nT"
             )
     if whole.sum() < FEWEST_ROWS:
         raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
@@ -116,7 +116,7 @@ def with_places_between_fixes(array: SensorArray, readings: Readings) -> tuple[S
     n = len(readings)
     _LOG.warning(
         f"places stand still in {found.held} of {n} rows: they are interpolated between fixes at"
-        f" {found.rate_Hz:.3g} Hz" + (f", and the last {n - found.end} rows are ignored" if found.end < n else "")
+        f" {found.rate_Hz:.3g} Hz" + (f", and the last {n - found.end} rows are left out" if found.end < n else "")
     )
     error_m = found.error_m if readings.interpolated_m is None else np.maximum(found.error_m, readings.interpolated_m)
     poses = {"array_position_m": found.position_m, "array_rotation": found.rotation, "interpolated_m": error_m}
@@ -287,7 +287,7 @@ def leaping_rows(readings: Readings) -> BoolArray:
     leaps = way > FASTEST_M_S * np.diff(time_s)
     wild = np.concatenate([[False], leaps[1:] & leaps[:-1], [False]])
     if wild.any():
-        _LOG.warning(f"spikes in the positions: {wild.sum()}; their rows are ignored")
+        _LOG.warning(f"spikes in the positions: {wild.sum()}; their rows are left out")
     left = np.flatnonzero(leaps & ~wild[1:] & ~wild[:-1])
     if left.size:
         k = int(left[0])
@@ -311,7 +311,7 @@ def rows_without_attitude(array: SensorArray, readings: Readings) -> BoolArray:
     if not none.size - turning.sum() >= FEWEST_ROWS:
         return none
     if turning.any():
-        _LOG.warning(f"{turning.sum()} rows of turns are ignored, because the course is not the attitude there")
+        _LOG.warning(f"{turning.sum()} rows of turns are left out, because the course is not the attitude there")
     return turning
 
 
@@ -360,7 +360,7 @@ def _usable_base(base: Readings) -> Readings:
     place_m[:, 0] = read.time_s * (_BASE_STEP / step_s)
     wild = wild_readings(read.values_T[:, 0], place_m, 1.0, _BASE_NOISE_T, 0.0)
     if wild.any():
-        _LOG.warning(f"spikes in the readings of the base station: {wild.sum()}; they are ignored")
+        _LOG.warning(f"spikes in the readings of the base station: {wild.sum()}; they are left out")
     return _some(read, ~wild)
 
 

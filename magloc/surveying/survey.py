@@ -162,8 +162,7 @@ def survey(
             _LOG.warning(f"the lag between readings and poses is doubtful: {lag.doubt}")
         if lag.is_significant:
             _LOG.warning(
-                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as targets and opposite"
-                " lines show; this is corrected"
+                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses; this is corrected"
             )
             tiled, _ = tiled.settle(strongest_sources, each, tell)
         tiled, due = tiled.settle(significant_sources, each, tell)

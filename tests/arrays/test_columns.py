@@ -44,13 +44,13 @@ class TestMissing:
         array = array_of(tmp_path, '[columns]\nvalid = {column = "MagValid", equals = [1]}\n')
         found = read(tmp_path, array, self.LOG.format(1))
         np.testing.assert_allclose(1e9 * found.values_T, [[1.0, 2.0], [np.nan, np.nan], [5.0, 6.0]])
-        assert "the readings of 1 rows have MagValid that is not 1 and are ignored" in caplog.text
+        assert "the readings of 1 rows have MagValid that is not 1 and are left out" in caplog.text
 
     def test_they_are_counted_and_named(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         array = array_of(tmp_path, '[columns]\ndummy = [7777]\nunit = "uT"\n')
         read(tmp_path, array, "time_s,low_nT,high_nT\n0,7777,2\n1,3,-99999\n2,7777,*\n")
         each = "2 of sensor low (7777000), 2 of sensor high (-99999000, *)"
-        assert f"dummy values are ignored: 4 in all, {each}" in caplog.text
+        assert f"dummy values are left out: 4 in all, {each}" in caplog.text
 
     def test_the_array_file_keeps_them(self, tmp_path: Path) -> None:
         columns = '[columns]\ndummy = [-7.5, "*"]\nvalid = {column = "V", equals = [1, 4]}\ncomment = ["#", "/"]\n'

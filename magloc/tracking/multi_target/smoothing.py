@@ -96,7 +96,7 @@ class YoungTrack:
             if passes >= _LEAST_PASSES and score > best + _HOPELESS:
                 return None
             sizes = np.abs(offsets[..., :N_SEEN])
-            sizes[..., 3:] /= np.linalg.norm(track[..., 3:N_SEEN], axis=-1, keepdims=True)
+            sizes[..., 3:] /= np.maximum(np.linalg.norm(track[..., 3:N_SEEN], axis=-1, keepdims=True), 1e-300)
             length = min(1.0, _LONGEST / max(float(sizes.max(initial=0.0)), 1e-300))
             before, last = last, offsets[-1].ravel() / np.linalg.norm(S[:-N_COMMON], axis=1)
             # Barzilai and Borwein's length: steps that lead back are made shorter.

@@ -90,7 +90,7 @@ class TestRows:
     def test_a_row_cut_at_the_end(self, caplog: pytest.LogCaptureFixture) -> None:
         """The battery was empty: the last number may be half of one."""
         assert rows_of(read("t,Mag,B\n0,48.5,1\n1,48.6,2\n2,48")).tolist() == ROWS[:2]
-        assert "the last row is incomplete and is ignored" in caplog.text
+        assert "the last row is incomplete and is left out" in caplog.text
 
 
 class TestBadLogs:

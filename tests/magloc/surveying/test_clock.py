@@ -106,6 +106,8 @@ class TestAgreedLag:
         """The smaller error counts."""
         assert agreed_lag(self.LINES, ClockLag(-0.48, 0.01)) == ClockLag(-0.48, 0.01)
         assert agreed_lag(self.LINES, ClockLag(-0.48, 0.09)) == self.LINES
+        weak = agreed_lag(ClockLag(-0.58, 0.21), ClockLag(-0.322, 0.006))
+        assert weak.doubt == "the targets alone show it, opposite lines give -0.580 ± 0.210 s"
 
     def test_disagreement(self) -> None:
         """Lines need no model; the doubt states both."""
@@ -114,7 +116,10 @@ class TestAgreedLag:
         assert found.doubt == "the targets show -0.269 ± 0.008 s, opposite lines -0.515 ± 0.030 s"
 
     def test_one_of_them(self) -> None:
-        assert agreed_lag(UNKNOWN, ClockLag(0.2, 0.01)) == ClockLag(0.2, 0.01)
+        alone = agreed_lag(UNKNOWN, ClockLag(0.2, 0.01))
+        assert alone[:2] == (0.2, 0.01)
+        assert "the targets alone" in alone.doubt
+        assert not agreed_lag(UNKNOWN, ClockLag(0.01, 0.01)).doubt
         assert agreed_lag(self.LINES, UNKNOWN) == self.LINES
         assert not agreed_lag(UNKNOWN, UNKNOWN).is_significant
 
