@@ -33,6 +33,7 @@ FIRM = 0.2
 """Relative σ of the scaled moment below which its error is one of strength and direction."""
 # A direction orthogonal to that of the chart has infinite coordinates: this bounds the cosine between them.
 _LEAST_COSINE = 0.05
+_LEAST_NORM = 1e-150  # of a moment; squares of smaller ones underflow
 _VELOCITY = slice(6, 9)
 
 
@@ -149,7 +150,7 @@ class Chart:
     def _firm_moments(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return firm moments (f, 3) at r' = r, and their derivative by r⁴ δμ."""
         m = self.x[self.firm, 3:6]
-        size = np.linalg.norm(m, axis=-1, keepdims=True)
+        size = np.maximum(np.linalg.norm(m, axis=-1, keepdims=True), _LEAST_NORM)
         along = m / size
         change = (self.length[self.firm] ** self.power)[:, None] * e[self.firm, 3:6] / size
         nu = np.sum(along * change, axis=-1, keepdims=True)
