@@ -28,7 +28,8 @@ struct RuntimeStates {
   StatePlaces places;
 };
 
-// Optional states that are chosen when the program is compiled. A field gain has three equal rows: the first represents all.
+// Optional states that are chosen when the program is compiled. A field gain has three equal rows: the first represents
+// all.
 template <int... chosen>
 constexpr StatePlaces places_of() {
   StatePlaces found = {6, {}};
