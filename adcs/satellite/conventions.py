@@ -107,9 +107,9 @@ def check_conventions(telemetry: Telemetry, record: Record, used: Collection[str
         if far and not any(name.startswith(("the gyro", "the magnetometer in ")) for name in named):
             raise ValueError(
                 "Input telemetry must have a field along the orbit whose modulus is within "
-                f"{100 * _MOST_MODULUS_ERROR:.0f} % (rms) of the model; instead received {far} %, which signs and axes "
-                "of a sensor cannot cause. Check start, altitude, inclination and node of the orbit. If they are "
-                f"right, undo this: {', or '.join(named[:2])}."
+                f"{100 * _MOST_MODULUS_ERROR:.0f} % (rms) of the model; instead received {far} %, more than signs and "
+                "axes cause. Check the orbit: start, altitude, inclination and node. Then undo this"
+                f"{' or another one' if len(named) > 1 else ''}: {named[0]}."
             )
         is_near = _NAMED_MODULUS_ERROR < error <= _MOST_MODULUS_ERROR
         raise ValueError(

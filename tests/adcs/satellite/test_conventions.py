@@ -106,10 +106,10 @@ class TestLeftAlone:
             latitude_argument_deg=latitude_deg,
             epoch=satellite.start,
         )
-        with pytest.raises(ValueError, match="Check start, altitude"):
+        with pytest.raises(ValueError, match="Check the orbit: start, altitude"):
             adcs.estimate(log, replace(satellite, orbit=orbit), sensors="mag+sun+gyro", states=["gyro-bias"])
 
-    @pytest.mark.parametrize(("gain", "words"), [(1.0, ""), (1.08, "check the orbit too"), (1.13, "Check start")])
+    @pytest.mark.parametrize(("gain", "words"), [(1.0, ""), (1.08, "check the orbit too"), (1.13, "Check the orbit")])
     def test_a_modulus_that_is_off_names_the_orbit(self, flight, gain, words):
         """Exchanged axes, and a modulus that they do not explain."""
         log, satellite = flight
