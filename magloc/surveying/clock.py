@@ -74,18 +74,18 @@ def agreed_lag(lines: ClockLag, targets: ClockLag) -> ClockLag:
     Errors of the places that last a whole line, sources that are not found and other errors of the model make the fit
     of the targets certain of a wrong lag. The lines need no model.
     """
-    if not math.isfinite(lines.sigma_s):
-        alone = "the targets alone show it, opposite lines do not determine a lag" if targets.is_significant else ""
-        return targets._replace(doubt=alone)
-    if not math.isfinite(targets.sigma_s):
+    if abs(targets.s - lines.s) >= _AGREE * math.hypot(targets.sigma_s, lines.sigma_s):
+        return lines._replace(doubt=f"the targets show {_with_sigma(targets)} s, opposite lines {_with_sigma(lines)} s")
+    if lines.sigma_s < targets.sigma_s:
         return lines
-    if abs(targets.s - lines.s) < _AGREE * math.hypot(targets.sigma_s, lines.sigma_s):
-        if lines.sigma_s < targets.sigma_s:
-            return lines
-        alone = f"the targets alone show it, opposite lines give {lines.s:.3f} ± {lines.sigma_s:.3f} s"
-        return targets._replace(doubt=alone if targets.is_significant and not lines.is_significant else "")
-    doubt = f"the targets show {targets.s:.3f} ± {targets.sigma_s:.3f} s, opposite lines {lines.s:.3f}"
-    return lines._replace(doubt=f"{doubt} ± {lines.sigma_s:.3f} s")
+    if lines.is_significant or not targets.is_significant:
+        return targets
+    shown = f"give {_with_sigma(lines)} s" if math.isfinite(lines.sigma_s) else "do not determine a lag"
+    return targets._replace(doubt=f"the targets alone show it, opposite lines {shown}")
+
+
+def _with_sigma(lag: ClockLag) -> str:
+    return f"{lag.s:.3f} ± {lag.sigma_s:.3f}"
 
 
 def by_cost(one: Trial) -> float:

@@ -262,10 +262,10 @@ class TiledSurvey:
             white = replace(self.array, pose=replace(pose, position_m=size_m, correlation_s=0.0, position_white_m=0.0))
             # White errors resemble no lag.
             lag = estimate_lag(lambda lag_s: replace(piece_at(lag_s), array=white), lines=lines)
-            for _ in range(_POSES if lag.s else 0):
+            for _ in range(_POSES if lag.is_significant else 0):
                 posed, near = at_likeliest_pose(lag.s, None)
                 lag = estimate_lag(posed, here, near)
-                if not lag.s:
+                if not lag.is_significant:
                     break
             return lag
         return estimate_lag(piece_at, lines=lines)
