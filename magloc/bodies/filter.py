@@ -22,7 +22,15 @@ from magloc.bodies.locator import BodyLocator
 from magloc.bodies.plausibility import n_checks, warn_of_no_check
 from magloc.bodies.readable_filter import FilterState, predicted_state, updated_state
 from magloc.bodies.search import fit_problem, packed, signals_of_rows, unpacked
-from magloc.bodies.track import BodyMotion, BodyTrack, TrackRows, joined_rows, judged, nearest_poses, placement_effects
+from magloc.bodies.track import (
+    BodyMotion,
+    BodyTrack,
+    TrackRows,
+    flag_misfits,
+    joined_rows,
+    nearest_poses,
+    placement_effects,
+)
 from magloc.chi_square import quantile
 from magloc.levels import CONTRADICTION
 from magloc.measurement.channels import signals_of
@@ -100,7 +108,7 @@ class BodyTracker:
                 self._keep_errors()
                 self._state = None
         self._last_s = float(track.time_s[-1]) if n else self._last_s
-        self._recent = judged(track, self._recent)
+        self._recent = flag_misfits(track, self._recent)
         return track
 
     def _start(

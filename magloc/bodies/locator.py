@@ -27,7 +27,7 @@ from magloc.bodies.optima import (
     without_gaps,
 )
 from magloc.bodies.plausibility import check_lengths, warn_of_inside, warn_of_no_check
-from magloc.bodies.poses import BodyPoses, enlarged, with_bends
+from magloc.bodies.poses import BodyPoses, with_bends, with_doubts
 from magloc.bodies.search import (
     KEEP_WITHIN,
     N_CANDIDATES,
@@ -139,7 +139,7 @@ class BodyLocator:
                 values[i] = np.nan
         if self.find_causes and dof > 0:
             self._name_causes(rows, poses, ambient_T)
-        return with_bends(enlarged(poses), self._bends(rows, poses))
+        return with_bends(with_doubts(poses), self._bends(rows, poses))
 
     def _bends(self, rows: WhitenedRows, poses: BodyPoses) -> FloatArray:
         """Return the nonlinearity of readings (n,) over one σ of the best poses, in units of the noise."""

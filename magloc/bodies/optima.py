@@ -179,17 +179,9 @@ def _turns(body: MagnetBody) -> FloatArray:
 
 def _best(optima: RowOptima, length_m: float) -> RowOptima:
     """Return the optima with the least χ² that differ from the ones before."""
-    order = np.argsort(np.nan_to_num(optima.chi2, nan=np.inf), axis=1, kind="stable")
-    rows = np.arange(len(order))[:, None]
-    x, R, chi2 = optima.position_m[rows, order], optima.R[rows, order], optima.chi2[rows, order]
-    way = np.linalg.norm(np.diff(x, axis=1), axis=-1) / length_m
-    turn = np.linalg.norm(np.diff(R, axis=1), axis=(-2, -1))
-    again = np.zeros(chi2.shape, dtype=np.bool_)
-    again[:, 1:] = (way + turn < _SAME) & (np.diff(chi2, axis=1) < _SAME * (1.0 + chi2[:, 1:]))
-    last = again | ~np.isfinite(chi2)
-    order = np.take_along_axis(order, np.argsort(last, axis=1, kind="stable"), axis=1)[:, :N_KEPT]
-    empty = np.take_along_axis(last, np.argsort(last, axis=1, kind="stable"), axis=1)[:, :N_KEPT]
-    best = RowOptima(*(values[rows, order] for values in vars(optima).values()))
-    for values in vars(best).values():
-        values[empty] = np.nan
-    return best
+    optima = _in_order(optima)
+    way = np.linalg.norm(np.diff(optima.position_m, axis=1), axis=-1) / length_m
+    turn = np.linalg.norm(np.diff(optima.R, axis=1), axis=(-2, -1))
+    later = optima.chi2[:, 1:]
+    later[(way + turn < _SAME) & (np.diff(optima.chi2, axis=1) < _SAME * (1.0 + later))] = np.nan
+    return RowOptima(*(values[:, :N_KEPT] for values in vars(without_gaps(optima)).values()))

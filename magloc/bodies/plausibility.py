@@ -21,6 +21,7 @@ _LOG = logging.getLogger(__name__)
 _N_POSES = 256
 _UNSEEN = 30.0  # noise over the largest field of the sampled poses, beyond which no pose is seen
 _MM = 1e-3
+_STRONGEST_T = 4.0 * math.pi * MU0_OVER_4PI * 1.2e6  # remanence of the strongest magnets
 
 
 def check_lengths(array: SensorArray, body: MagnetBody) -> None:
@@ -64,8 +65,7 @@ def warn_of_inside(array: SensorArray, body: MagnetBody, poses: BodyPoses) -> No
         return
     magnets, _ = placed_magnets(body, poses.position_m[solved, 0], poses.R[solved, 0])
     apart = np.linalg.norm(magnets[:, :, None] - array.positions, axis=-1)
-    # The strongest magnets have 1.1 MA/m: a sphere of that magnetisation is the smallest that has the moment.
-    smallest_m = np.cbrt(3.0 * np.linalg.norm(body.moments_Am2, axis=1) / (4.0 * np.pi * 1.2e6))
+    smallest_m = np.array([_ball_radius_m(magnet, _STRONGEST_T) for magnet in body.magnets])
     inside = apart < smallest_m[:, None]
     if inside.any():
         _, k, s = np.argwhere(inside)[0].tolist()
@@ -96,11 +96,15 @@ def warn_of_no_check(array: SensorArray, n_unknowns: int) -> None:
         )
 
 
+def _ball_radius_m(magnet: Magnet, remanence_T: float) -> float:
+    """Return the radius of the ball that has the moment of a magnet with a remanence [m]."""
+    return math.cbrt(3.0 * MU0_OVER_4PI * magnet.modulus_Am2 / remanence_T)
+
+
 def _inner_radius(magnet: Magnet) -> float:
     """Return the radius of the largest sphere within a magnet, or of the smallest that has a dipole's moment [m]."""
     if magnet.shape is None:
-        volume_m3 = 4e-7 * math.pi * magnet.modulus_Am2 / LARGEST_REMANENCE_T
-        return float(np.cbrt(0.75 / math.pi * volume_m3))
+        return _ball_radius_m(magnet, LARGEST_REMANENCE_T)
     return 0.0 if magnet.shape.kind == "ring" else 0.5 * min(magnet.shape.size_m)
 
 
@@ -111,7 +115,7 @@ def _needed(magnet: Magnet) -> str:
         in_mm = ", ".join(f"{_MM * x:g}" for x in magnet.shape.size_m)
         return f"with size_m {size} (millimetres are {in_mm})"
     return (
-        f"with {magnet.modulus_Am2:.3g} A·m², that of a ball of {2e3 * _inner_radius(magnet):.3g} mm at least"
+        f"with {magnet.modulus_Am2:.3g} A·m², which needs a ball of {2e3 * _inner_radius(magnet):.3g} mm at least"
         " (is moment_Am2 a remanence in T?)"
     )
 

@@ -189,7 +189,7 @@ def with_bends(poses: BodyPoses, bend: FloatArray) -> BodyPoses:
     return poses
 
 
-def enlarged(poses: BodyPoses) -> BodyPoses:
+def with_doubts(poses: BodyPoses) -> BodyPoses:
     """Return poses with flags of doubtful covariances, which are enlarged where χ² is far beyond noise."""
     is_open = poses.solved & ~np.isfinite(poses.covariance[:, 0]).all(axis=(1, 2))
     is_misfit = exceeds(poses.chi2[:, 0], poses.dof, MISFIT)

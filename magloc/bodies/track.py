@@ -12,7 +12,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.bodies.body import MagnetBody
 from magloc.bodies.fit import linearise
 from magloc.bodies.poses import BodyPoses
-from magloc.chi_square import quantile
+from magloc.chi_square import exceeds
 from magloc.levels import MISFIT
 from magloc.measurement.rows import WhitenedRows
 from magloc.measurement.whitened import WhitenedModel
@@ -153,7 +153,7 @@ def placement_effects(
     return np.ascontiguousarray(of_places.transpose(0, 2, 1))
 
 
-def judged(track: BodyTrack, recent: FloatArray) -> FloatArray:
+def flag_misfits(track: BodyTrack, recent: FloatArray) -> FloatArray:
     """Flag the rows of a track whose NIS, with that of rows before, is far beyond noise; return the last ones.
 
     `recent` (m, 2) has NIS and degrees of freedom of the rows before. The covariance of these rows is enlarged.
@@ -163,8 +163,7 @@ def judged(track: BodyTrack, recent: FloatArray) -> FloatArray:
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(all_rows, axis=0)])
     end = len(recent) + 1 + np.arange(used.size)
     nis, dof = (sums[end] - sums[np.maximum(end - _RECENT, 0)]).T
-    limits = {d: quantile(int(d), MISFIT) for d in np.unique(dof).tolist()}
-    over = nis > np.array([limits[d] for d in dof.tolist()])
+    over = exceeds(nis, dof.astype(np.intp), MISFIT)
     for i, factor in zip(used[over].tolist(), (nis[over] / dof[over]).tolist(), strict=True):
         track.flags[i] = (*track.flags[i], "misfit")
         track.covariance[i] *= factor

@@ -1,8 +1,8 @@
 // A body followed over rows: an iterated extended Kalman filter of its pose, its rates, and lasting errors of magnets
 // and sensors. magloc/bodies/readable_filter.py is the readable reference.
 //
-// Readings depend on the pose and the errors only, the first d states. An update repeats that of a Kalman filter about
-// the last pose. The readings are linear in the sensors' errors, so their part of the gain is computed once a row.
+// Readings depend on the pose and the errors only, the first d states. An update iterates a Kalman update about the
+// last pose. The readings are linear in the sensors' errors, so their part of the gain is computed once a row.
 #pragma once
 #include "body.hpp"
 #include "padded.hpp"
@@ -20,8 +20,8 @@ class BodyFilter {
   const Padded<Lanes> S_;      // of the channels: covariance I + H P H^T, and the innovation
   const Padded<Lanes> error_;  // one row of the states
   double weight_ = 0.0;        // of a row
-  double *const rest_, *const multiplier_, *const ahead_, *const of_magnet_, *const strength_, *const errors_,
-                                                                                                   *const turned_;
+  double *const rest_, *const multiplier_, *const ahead_, *const of_magnet_, *const strength_;
+  double *const errors_, *const turned_;
 
  public:
   BodyFilter(const magloc_pose_track &p, Workspace &room)
