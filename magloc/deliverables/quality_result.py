@@ -178,7 +178,7 @@ class Quality(Result):
         again = np.flatnonzero(self.earlier >= 0)
         if again.size:
             now_s, then_s = self.time_s[[again[0], self.earlier[again[0]]]]
-            yield check("repeated rows", again.size, "", f"those from {now_s:.10g} s equal those from {then_s:.10g} s")
+            yield check("repeated rows", again.size, "", f"the row at {now_s:.10g} s is the same as at {then_s:.10g} s")
         yield check("duration", float(np.ptp(self.time_s)), "s")
         yield check("rate", 1.0 / self.interval_s, "Hz")
         share = self.jitter_s / self.interval_s

@@ -50,7 +50,7 @@ def array_near(array: SensorArray, magnet: Shape | None) -> SensorArray:
     magnet.check_aligned()
     if magnet.length_m > max(LARGEST_M, 2.0 * array.circumradius):
         raise ValueError(
-            f"Input size_m must be that of a magnet in metres; instead received {[*magnet.size_m]}, larger than the"
+            f"Input size_m must be the size of a magnet in metres; instead received {[*magnet.size_m]}, larger than the"
             f" array of {2.0 * array.circumradius:.3g} m. 10 mm are 0.01 m."
         )
     return ArrayNearMagnet(**{one.name: getattr(array, one.name) for one in fields(SensorArray)}, magnet=magnet)

@@ -92,8 +92,8 @@ def whole_rows(
     if (again := earlier >= 0).any():
         k = int(again.argmax())
         _LOG.warning(
-            f"{again.sum()} rows repeat earlier ones with new times, those from {readings.time_s[k]:.10g} s those from"
-            f" {readings.time_s[earlier[k]]:.10g} s: they are ignored"
+            f"{again.sum()} rows repeat earlier ones with new times and are left out; the row at"
+            f" {readings.time_s[k]:.10g} s is the same as at {readings.time_s[earlier[k]]:.10g} s"
         )
         readings = _some(readings, ~again)
     readings = _some(readings, ~leaping_rows(readings))

@@ -60,7 +60,7 @@ def exchanged_beside(
     place_m, turn = readings.array_position_m, readings.array_rotation
     assert place_m is not None
     assert turn is not None
-    at_m = array.positions.copy()
+    at_m = array.positions.copy()  # scipy rotates writable arrays only
     apart_m = {
         pair: float(np.linalg.norm((at_m[pair[0]] - at_m[pair[1]])[:2])) for pair in combinations(range(len(at_m)), 2)
     }

@@ -59,7 +59,7 @@ def likely_error_of_positions(tiled: TiledSurvey, each: Each) -> str:
     near = np.sort(nearest[away_m[nearest] < _WITHIN * (tiled.nearest_m + _DEEP_M)])
     if len(near) < FEWEST_ROWS:
         return ""
-    errors, changed = zip(*_corrected(tiled, rows[near]), strict=True)
+    errors, changed = zip(*_candidates(tiled, rows[near]), strict=True)
     chi2 = np.full(len(errors), math.inf)
     for number, result in each(chi2_of_strongest, [_piece(tiled, other) for other in changed]):
         chi2[number] = result["chi2"]
@@ -67,7 +67,7 @@ def likely_error_of_positions(tiled: TiledSurvey, each: Each) -> str:
     return str(errors[best]) if chi2[best] < min(_BETTER * chi2[0], _FITS) else ""
 
 
-def _corrected(tiled: TiledSurvey, rows: Readings) -> Iterator[tuple[str, Readings]]:
+def _candidates(tiled: TiledSurvey, rows: Readings) -> Iterator[tuple[str, Readings]]:
     """Yield errors of positions, and the rows without them; the first is none."""
     place_m, turn, ground_m = rows.array_position_m, rows.array_rotation, tiled.ground.terrain.height_m
     assert place_m is not None
