@@ -260,18 +260,21 @@ class ChartFilter:
         if elsewhere and fit.nis.min() > known.nis:
             # The refit moved to another place that explains the rows less well.
             return known
+        # The mode of all states is biased towards the array, by several σ if the source moves at random by more. Keep
+        # the filter's result unless the mode is elsewhere.
+        moves = not self.has_lasting_errors and (_range_motion(found, rows, motions) > found.log_range_sigma).all()
+        near = chdtri(n, CONTRADICTION) if moves else n
         if not self.has_lasting_errors and len(mixture) > 1:
-            # The components describe a curved valley better than a mode: keep them unless the mode is elsewhere.
+            # The components describe a curved valley better than a mode.
             best = found.x[np.argmax(found.log_weight)]
-            if mixture.square_distance(best).min() < n:
+            if mixture.square_distance(best).min() < near:
                 return known
         if len(found) == 1 and len(mixture) == 1:
             change = mixture.square_distance(found.x)[0]
             if change < SETTLED * n and found.widths[0] < OLD_WIDTH:
                 known = replace(known, young=())
-            if change < n and found.widths[0] < WIDER * mixture.widths[0]:
-                # The mode of all states is biased towards the array: keep the filter's result unless it is
-                # overconfident.
+            if change < near and found.widths[0] < WIDER * mixture.widths[0]:
+                # The filter is not overconfident.
                 return known
         found = self._refit_by_range(found, rows, motions)
         if self.errors.n_states and found.log_range_sigma < NARROWER * mixture.log_range_sigma:
@@ -301,11 +304,8 @@ class ChartFilter:
         The valley of ranges is curved, and its width varies along it, so that its mode is biased towards the array.
         This does not apply to a source that moves by more than the σ of its range: then each row has another valley.
         """
-        sigma, span_s = np.linalg.norm(found.S[:, 0], axis=1), rows[-1].row.time_s - rows[0].row.time_s
-        n = motions[-1].n_states
-        S_q = np.stack([motions[-1].step(x, span_s)[2] for x in found.x[:, :n]])
-        noise = np.linalg.norm((found.chart.inverse_jacobian()[:, :1, :n] @ S_q)[:, 0], axis=1)
-        if not ((sigma > BENT_RANGE) & (sigma > noise)).any():
+        sigma = np.linalg.norm(found.S[:, 0], axis=1)
+        if not ((sigma > BENT_RANGE) & (sigma > _range_motion(found, rows, motions))).any():
             return found
         k, cell = np.divmod(np.arange(len(sigma) * N_CELLS), N_CELLS)
         pitch = CELL_PITCH * sigma[k]
@@ -315,6 +315,13 @@ class ChartFilter:
             return found
         spread = replace(fit.mixture, log_weight=fit.mixture.log_weight + np.log(pitch[fit.origin]))
         return spread.take(unique_components(spread, cell[fit.origin])).reduce()
+
+
+def _range_motion(found: Mixture, rows: Sequence[RowMeasurement], motions: Sequence[MotionModel]) -> FloatArray:
+    """Return σ (K,) of the components' change of log-range over all rows, by the noise of the motion."""
+    n, span_s = motions[-1].n_states, rows[-1].row.time_s - rows[0].row.time_s
+    S_q = np.stack([motions[-1].step(x, span_s)[2] for x in found.x[:, :n]])
+    return np.linalg.norm((found.chart.inverse_jacobian()[:, :1, :n] @ S_q)[:, 0], axis=1)
 
 
 def _is_credible(found: Mixture, nis: FloatArray, rows: Sequence[RowMeasurement]) -> bool:

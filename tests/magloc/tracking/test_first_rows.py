@@ -22,6 +22,7 @@ from magloc.measurement.nuisances import without_lasting_errors
 from magloc.tracking.consistency import nees_of
 from magloc.tracking.files import json_entry
 from magloc.tracking.motion import MotionModel
+from magloc.tracking.results import track_column
 from magloc.tracking.rows import Row, rows_of
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.posterior_bound import posterior_bound
@@ -62,6 +63,16 @@ def test_the_true_place_is_kept_beside_another() -> None:
     tracker = Tracker(ARRAY, WALK)
     ranges = [np.linalg.norm(point.position_m - ARRAY.centroid) for point in tracker.run(rows_of(readings[:25]))]
     assert min(ranges[1:]) > 6.5
+
+
+@pytest.mark.parametrize("seed", [2012, 2043])
+def test_a_refit_of_many_rows_is_not_biased_towards_the_array(seed: int) -> None:
+    """Of 56 rows at 1 nT, the mode of all states was 14 % nearer than the source, 5 σ, and replaced the filter's."""
+    array = tetrahedron(1.5, "vector", 1e-9)
+    truth, readings = drawn(WALK, 60, seed, without_lasting_errors(array))
+    found_m = track_column(list(Tracker(array, WALK).run(rows_of(readings[:57]))), "position_m", 3)[-1]
+    range_m, true_m = np.linalg.norm(np.stack([found_m, truth[56, :3]]) - array.centroid, axis=1)
+    assert abs(np.log(range_m / true_m)) < 0.1
 
 
 @pytest.mark.parametrize("motion", [WALK, VELOCITY], ids=["random walk", "constant velocity"])
