@@ -13,7 +13,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
 import sims
@@ -115,33 +115,38 @@ class TestSourceAtRest:
         distances = []
         for seed in range(n_seeds):
             simulation = sims.simulate(sims.read_scenario("paper"), seed)
-            readings = simulation.readings.values_T
             points = list(Tracker(simulation.array, REST).run(rows_of(simulation.readings)))
             assert points[0].status == "acquired"
             last = points[-1]
-            fitted, covariance = _batch_fit(simulation.array, readings)
+            model = _MeanReadings(simulation.array, simulation.readings.values_T)
             assert last.position_m is not None
             assert last.moment_Am2 is not None
             assert last.covariance is not None
-            root = np.linalg.cholesky(covariance / np.outer(UNIT, UNIT))
-            error = np.concatenate([last.position_m, last.moment_Am2]) - fitted
-            distances.append(np.linalg.norm(np.linalg.solve(root, error / UNIT)))
-            claimed = np.sqrt(np.diagonal(last.covariance) / np.diagonal(covariance))
+            found, fitted = np.concatenate([last.position_m, last.moment_Am2]) / UNIT, model.fit()
+            root = np.linalg.cholesky(model.covariance(fitted))
+            distances.append(np.linalg.norm(np.linalg.solve(root, found - fitted)))
+            claimed = np.sqrt(np.diagonal(last.covariance) / np.diagonal(model.covariance(found))) / UNIT
             np.testing.assert_allclose(claimed, 1.0, atol=0.04)
         assert math.sqrt(float(np.mean(np.square(distances)))) < 0.4
 
 
-def _batch_fit(array: SensorArray, readings_T: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least squares of all rows: of their mean, because the source and the array are at rest."""
-    sigma = array.sensors[0].noise_T / math.sqrt(len(readings_T))
-    mean = readings_T.mean(axis=0).reshape(-1, 3)
+class _MeanReadings:
+    """Mean of all rows: it is sufficient, because the source and the array are at rest. Sources are in UNIT."""
 
-    def residuals(y: FloatArray) -> FloatArray:
-        model = magpylib_field(array.positions, y[:3], 100.0 * y[3:])
-        off = mean - model
-        return np.asarray((off - off.mean(axis=0)).ravel() / sigma)
+    def __init__(self, array: SensorArray, readings_T: FloatArray) -> None:
+        self._array, self._readings_T = array, readings_T.mean(axis=0).reshape(-1, 3)
+        self._sigma = array.sensors[0].noise_T / math.sqrt(len(readings_T))
 
-    start = np.array([5.0, 0.0, 0.306, 1.0, 0.0, 0.0])
-    fit = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
-    J = np.asarray(fit.jac)
-    return fit.x * UNIT, np.linalg.inv(J.T @ J) * np.outer(UNIT, UNIT)
+    def _residuals(self, y: FloatArray) -> FloatArray:
+        off = self._readings_T - magpylib_field(self._array.positions, y[:3], 100.0 * y[3:])
+        return np.asarray((off - off.mean(axis=0)).ravel() / self._sigma)
+
+    def fit(self) -> FloatArray:
+        """Least squares."""
+        start = np.array([5.0, 0.0, 0.306, 1.0, 0.0, 0.0])
+        return np.asarray(least_squares(self._residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14).x)
+
+    def covariance(self, y: FloatArray) -> FloatArray:
+        """Cramér-Rao bound at a source."""
+        J = approx_fprime(y, self._residuals, 1e-6)
+        return np.linalg.inv(J.T @ J)
