@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
@@ -274,9 +275,12 @@ def shade_gaps(ax: Axes, time_s: FloatArray, present: NDArray[np.bool_], label: 
     # One patch for each of thousands of gaps takes minutes: gaps below a pixel are omitted, the rest is one patch.
     seen = end_s - begin_s > np.ptp(time_s) / _PIXELS
     if seen.any():
-        spans = np.column_stack([begin_s, end_s - begin_s])[seen].tolist()
+        left, right, zero = begin_s[seen], end_s[seen], np.zeros(seen.sum())
+        boxes = np.stack([[left, zero], [right, zero], [right, zero + 1.0], [left, zero + 1.0]]).transpose(2, 0, 1)
         style: dict[str, Any] = {"facecolor": "none", "edgecolor": LIGHT_GREY, "hatch": "////", "lw": 0.0}
-        ax.broken_barh(spans, (0.0, 1.0), transform=ax.get_xaxis_transform(), label=label, **style)
+        patches = PolyCollection(list(boxes), transform=ax.get_xaxis_transform(), label=label, **style)
+        ax.add_collection(patches, autolim=False)  # the limits of the values stay
+        ax.update_datalim(boxes.reshape(-1, 2), updatey=False)
 
 
 def truth_columns(truth_m: FloatArray) -> dict[str, Column]:

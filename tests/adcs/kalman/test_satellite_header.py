@@ -93,9 +93,10 @@ def numbers_of(estimate: SatelliteEstimate) -> Array:
 
 
 def assert_equal(found: Array, estimates: list[SatelliteEstimate], n: int) -> None:
-    """Attitude and rate to 1e-12, other states to 1e-10 of their σ, σ and NIS to 9 digits, and the same flags.
+    """Attitude and rate to 1e-12, other states to 1e-9 of their σ, σ and NIS to 9 digits, and the same flags.
 
-    The first good reading after a long search lowers σ a thousandfold, which loses three digits.
+    The first good reading after a long search lowers σ a thousandfold, which loses three digits. Rounding
+    depends on the processor: states differ by up to 1.1e-10 of their σ on some.
     """
     expected = np.stack([numbers_of(one) for one in estimates])
     np.testing.assert_array_equal(found[:, :2], expected[:, :2])
@@ -103,7 +104,7 @@ def assert_equal(found: Array, estimates: list[SatelliteEstimate], n: int) -> No
     found, expected = found[started], expected[started]
     np.testing.assert_allclose(found[:, 2:9], expected[:, 2:9], rtol=0, atol=1e-12)
     states, sigma, nis = slice(9, 3 + n), slice(3 + n, 3 + 2 * n), slice(3 + 2 * n, 7 + 2 * n)
-    assert (np.abs(found[:, states] - expected[:, states]) <= 1e-10 * expected[:, sigma].max(axis=0)[6:]).all()
+    assert (np.abs(found[:, states] - expected[:, states]) <= 1e-9 * expected[:, sigma].max(axis=0)[6:]).all()
     np.testing.assert_allclose(found[:, sigma], expected[:, sigma], rtol=1e-9)
     np.testing.assert_allclose(found[:, nis], expected[:, nis], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(

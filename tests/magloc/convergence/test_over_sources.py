@@ -202,7 +202,7 @@ class TestBodies:
         assert not SourcesMap(replace(PAPER, body_length_m=None), 5)._lengths(np.array([[3.0, 0.0, 0.0]])).any()
         values = unsaid._values_of(position, moment, unsaid._readings(position, moment, noise, errors))
         bounds = points._values_of(position, moment, points._readings(position, moment, noise, errors))
-        assert (values["sigma_position"] >= bounds["sigma_position"]).all()
+        assert (values["sigma_position"] >= (1.0 - 1e-9) * bounds["sigma_position"]).all()  # equal, but for rounding
         assert (values["sigma_position"] > bounds["sigma_position"]).any()
 
 

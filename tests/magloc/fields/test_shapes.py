@@ -40,19 +40,19 @@ def volume(shape: Shape) -> float:
 
 
 def magpylib_field(shape: Shape, points: Array, moment: Array) -> Array:
-    """Field by magpylib, with mu_0 = 4 pi 1e-7."""
-    size, magnetisation = shape.size_m, moment / volume(shape)
+    """Field outside the material by magpylib, from the polarisation, because the mu_0 of its versions differ."""
+    size, polarisation = shape.size_m, MU0 * moment / volume(shape)
     magnet: magpylib.magnet.Cuboid | magpylib.magnet.Cylinder | magpylib.magnet.CylinderSegment | magpylib.magnet.Sphere
     if shape.kind == "cuboid":
-        magnet = magpylib.magnet.Cuboid(dimension=size, magnetization=magnetisation)
+        magnet = magpylib.magnet.Cuboid(dimension=size, polarization=polarisation)
     elif shape.kind == "cylinder":
-        magnet = magpylib.magnet.Cylinder(dimension=size, magnetization=magnetisation)
+        magnet = magpylib.magnet.Cylinder(dimension=size, polarization=polarisation)
     elif shape.kind == "ring":
         segment = (size[0] / 2.0, size[1] / 2.0, size[2], 0.0, 360.0)
-        magnet = magpylib.magnet.CylinderSegment(dimension=segment, magnetization=magnetisation)
+        magnet = magpylib.magnet.CylinderSegment(dimension=segment, polarization=polarisation)
     else:
-        magnet = magpylib.magnet.Sphere(diameter=size[0], magnetization=magnetisation)
-    return MU0 * np.asarray(magnet.getH(points)).reshape(points.shape)
+        magnet = magpylib.magnet.Sphere(diameter=size[0], polarization=polarisation)
+    return np.asarray(magnet.getB(points)).reshape(points.shape)
 
 
 def volume_dipoles(shape: Shape, n: int = 12) -> tuple[Array, Array]:

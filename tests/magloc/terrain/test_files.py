@@ -53,7 +53,7 @@ def write_raster(
 ) -> FloatArray:
     """Write the hill on cells of about 0.8 m, and return the centre of the raster."""
     rasterio = pytest.importorskip("rasterio")
-    centre = to_system(np.zeros((1, 2)), crs)[0]
+    centre = to_system(np.zeros((2, 2)), crs)[0]  # pyproj 3.7 warns of arrays of one number
     cell, n = 0.8 / UNITS[crs], 160
     cosine, sine = cell * np.cos(np.radians(turn_deg)), cell * np.sin(np.radians(turn_deg))
     axes = np.array([[cosine, sine], [sine, -cosine]])  # of columns and rows
