@@ -60,6 +60,8 @@ _PROBATION_ROWS = 11
 _RESTART_PAUSE, _FIRST_PAUSE = 15, 4
 # Largest number of restarts with an additional source, and of others.
 _MOST_RESTARTS = 3
+# Rows for which a doubt lasts: restarts and births reset the residuals, and may be wrong at first.
+_DOUBT_LASTS = 25
 # Rows between tests for redundant sources.
 _DOUBT_EVERY = 12
 # Memories of the excess of χ² [rows], and five standard deviations of its mean with each.
@@ -133,7 +135,7 @@ class SourcesTracker:
         self._hypotheses: list[Hypothesis] = []
         self._numbers: dict[int, int] = {}
         self._time_s = math.nan
-        self._n_rows = 0
+        self._n_rows = self._doubtful_rows = 0
         self._ids: tuple[int, ...] = ()
         self._last_restart = self._next_restart = -_RESTART_PAUSE
         self._pause = _FIRST_PAUSE
@@ -184,7 +186,9 @@ class SourcesTracker:
         is_poor = bool((best.excess > _POOR).any())
         left, energy = problem.mean_residual(best.health) if best.ids else (None, 0.0)
         if status == "tracked" and (is_poor or energy > SENSOR_LIMIT):
-            status = "doubtful"
+            self._doubtful_rows = _DOUBT_LASTS
+        if status == "tracked" and self._doubtful_rows:
+            status, self._doubtful_rows = "doubtful", self._doubtful_rows - 1
         poor = is_poor or best.health.suspect is not None
         if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
             self._hypotheses += self._removals(problem, best, found)
