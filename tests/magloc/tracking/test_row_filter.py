@@ -269,7 +269,8 @@ class TestOneSource:
         for x, S, x_found, S_found in zip(at.x, at.S, found.x, found.S, strict=True):
             moved, F, S_q = motion.step(x[:n], 0.5)
             expected = np.append(moved, kept * x[n:])
-            np.testing.assert_allclose(x_found, expected, rtol=1e-12, atol=1e-13 * np.linalg.norm(moved))
+            # A turn rounds each component by a share of the whole: 4e-13 of it in one of 75 random examples.
+            np.testing.assert_allclose(x_found, expected, rtol=1e-12, atol=1e-12 * np.linalg.norm(moved))
             inverse = at.row.chart(moved[None]).inverse_jacobian()[0]
             A = inverse @ F @ Chart.at(x[None, :n], centroid, at.row.radius_m).jacobian(np.zeros((1, n)))[0]
             spread = block_diag(A, np.diag(kept)) @ S
