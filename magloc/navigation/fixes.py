@@ -136,9 +136,9 @@ def _errors_m(place: FloatArray, time_s: FloatArray, known: IntArray) -> FloatAr
     interval, times u (1 - u). At a corner it is up to four times as large.
     """
     at_s = time_s[known]
-    took_s = np.diff(at_s)
-    # The readers of files refuse infinite places and equal times.
+    # The readers of files refuse infinite places and times, and equal times.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        took_s = np.diff(at_s)
         velocity = np.diff(place[known], axis=0) / took_s[:, None]
         bend = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
     most = np.maximum(np.append(bend, 0.0), np.concatenate([[0.0], bend]))  # at either end of an interval

@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from arrays.columns import POSITION_COLUMNS
+from arrays.io.csv import Table
 from arrays.typing import FloatArray
-from magloc.navigation.fixes import Interpolated, between_fixes, interval_of_fixes
+from magloc.navigation.fixes import Interpolated, between_fixes, interval_of_fixes, without_gaps
 
 
 def way(time_s: FloatArray, bend: float = 0.0) -> FloatArray:
@@ -68,6 +70,17 @@ class TestLostFixes:
         assert of_all is not None
         assert of_all.held == 39
         np.testing.assert_allclose(of_all.position_m, way(time_s), atol=1e-9)
+
+
+class TestGaps:
+    @pytest.mark.parametrize("time_s", [[0.0, 1.0, 2.0, np.inf, np.inf], [-np.inf, -1e300, 0.0, 1e300, np.inf]])
+    def test_times_that_overflow_are_no_fault_here(self, time_s: list[float]) -> None:
+        """The reader of the table refuses them afterwards."""
+        places = np.array([[1.0, 2.0, 3.0], [np.nan] * 3, [2.0, 3.0, 3.0], [3.0, 3.0, 3.0], [4.0, 3.0, 3.0]])
+        values = np.column_stack([time_s, places])
+        table, error_m = without_gaps(Table("log.csv", ("time_s", *POSITION_COLUMNS), 1, values, np.arange(5) + 2))
+        assert np.isfinite(table.values[:, 1:]).all()
+        assert error_m is not None
 
 
 class TestIntervalOfFixes:
