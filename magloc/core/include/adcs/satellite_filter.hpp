@@ -394,9 +394,8 @@ class SatelliteFilter {
       return Status::ok;
     }
     const Estimate<Real> &x = filter_.main().x;
-    const auto &P = filter_.main().P();
     bool is_good = is_finite(x.motion.q.scalar) && is_finite(dot(x.motion.w, x.motion.w));
-    for (int i = 0; i < n; ++i) is_good = is_good && P[i][i] > 0 && is_finite(P[i][i]);
+    for (int i = 0; i < n; ++i) is_good = is_good && covariance(i, i) > 0 && is_finite(covariance(i, i));
     if (!is_good) {
       restart();
       return Status::diverged;
