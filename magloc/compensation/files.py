@@ -55,7 +55,7 @@ class LogFile:
         form = replace(form, others=(*form.others, *currents))
         text = read_text(path, "a CSV file", form.encoding).replace("\r\n", "\n").replace("\r", "\n")
         table = without_gaps(form.table(text, str(path)))[0]
-        for name in currents:
+        for name in ("time_s", *currents):
             table.require(name, currents)
         table.refuse_back("time_s", ~(np.diff(table.times()) > 0.0), "time to increase from row to row", "{:.15g}")
         kept = [i for i, name in enumerate(table.header) if name not in currents]

@@ -69,9 +69,10 @@ def between_fixes(time_s: FloatArray, position_m: FloatArray, rotation: Rotation
 def without_gaps(table: Table) -> tuple[Table, FloatArray | None]:
     """Return the table of a log with places in all rows, and the standard deviations (n,) that interpolation adds [m].
 
-    Rows before the first place or after the last one are ignored. Without a missing place the second item is None.
+    Rows before the first place or after the last one are ignored. Without a missing place, or without times, the second
+    item is None.
     """
-    if not set(POSITION_COLUMNS) <= set(table.header):
+    if not {"time_s", *POSITION_COLUMNS} <= set(table.header):
         return table, None
     at = [table.header.index(name) for name in POSITION_COLUMNS]
     time_s, place = table.values[:, table.header.index("time_s")], table.values[:, at]

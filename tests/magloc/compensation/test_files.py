@@ -76,3 +76,10 @@ def test_currents_that_are_none(tmp_path: Path, current: str, fragment: str) -> 
         LogFile.read(path, ONE, [current])
     with pytest.raises(InputError, match="found motor_A twice"):
         LogFile.read(path, ONE, ["motor_A", "motor_A"])
+
+
+def test_a_log_without_times(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("times,mag_nT,array_x_m,array_y_m,array_z_m\n0,48000,,,\n1,48001,1,2,3\n")
+    with pytest.raises(InputError, match=r"column time_s: found no such column \(the nearest is times\)"):
+        LogFile.read(path, ONE)

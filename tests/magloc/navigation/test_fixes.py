@@ -82,6 +82,11 @@ class TestGaps:
         assert np.isfinite(table.values[:, 1:]).all()
         assert error_m is not None
 
+    def test_without_times_nothing_is_interpolated(self) -> None:
+        """The reader of the table asks for them."""
+        table = Table("log.csv", POSITION_COLUMNS, 1, np.array([[0.0, 0.0, 0.0], [np.nan] * 3]), np.arange(2) + 2)
+        assert without_gaps(table) == (table, None)
+
 
 class TestIntervalOfFixes:
     def test_is_the_length_of_the_only_gap(self) -> None:
