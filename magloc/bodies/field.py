@@ -98,7 +98,15 @@ def _shape_fields(
 
 def body_fields(body: MagnetBody, points_m: FloatArray, position_m: FloatArray, R: FloatArray) -> FloatArray:
     """Return the field (..., N, 3) [T] of a body; for the arguments see :func:`magnet_fields`."""
-    return np.asarray(magnet_fields(body, points_m, position_m, R).field_T.sum(axis=-3))
+    places, moments = placed_magnets(body, position_m, R)
+    parts = []
+    for k, magnet in enumerate(body.magnets):
+        place, moment = places[..., k, None, :], moments[..., k, None, :]
+        if magnet.shape is None:
+            parts.append(dipole.field(points_m, place, moment))
+        else:
+            parts.append(_shape_fields(magnet, magnet.shape, points_m - place, R)[0])
+    return np.sum(parts, axis=0)
 
 
 def pose_jacobian(body: MagnetBody, fields: MagnetFields, R: FloatArray) -> FloatArray:
