@@ -337,8 +337,10 @@ class SatelliteFilter:
         memory = _aligned(after.memory if after.n_taken else np.zeros(core.workspace_size("mekf_runs", work)))
         n = tracks.q.shape[1]
         core.run("mekf_runs", work, n, block=n, workspace=memory)
-        last, variance = tracks.at(-1), np.diagonal(tracks.at(-1).P[0])
-        if not (np.isfinite(last.q).all() and ((variance > 0.0) & (variance < 1e300)).all()):  # four times it is finite
+        last = tracks.at(-1)
+        variance = np.diagonal(last.P[0])
+        # An estimate scales the covariance by four, which must not overflow.
+        if not (np.isfinite(last.q).all() and ((variance > 0.0) & (variance < 1e300)).all()):
             raise ValueError("Input readings must be such that an attitude explains them; instead the filter diverges.")
         return replace(after, n_taken=after.n_taken + n - bool(after.n_taken), memory=memory), tracks
 

@@ -10,6 +10,7 @@ Positions are in the array's frame [m], fields in T. Leading axes are poses.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,14 +54,12 @@ def magnet_fields(body: MagnetBody, points_m: FloatArray, position_m: FloatArray
     R : ndarray, shape (..., 3, 3)
         Rotation matrix from the body's frame to the array's.
     """
-    places, moments = placed_magnets(body, position_m, R)
-    parts = []
-    for k, magnet in enumerate(body.magnets):
-        place, moment = places[..., k, None, :], moments[..., k, None, :]
-        if magnet.shape is None:
-            parts.append(dipole_fields(points_m, place, moment))
-        else:
-            parts.append(_shape_fields(magnet, magnet.shape, points_m - place, R))
+    parts = [
+        dipole_fields(points_m, place, moment)
+        if magnet.shape is None
+        else _shape_fields(magnet, magnet.shape, points_m - place, R)
+        for magnet, place, moment in _magnets_in_array(body, position_m, R)
+    ]
     field_T, by_position, by_rotation = (
         np.stack(part, axis=-3 - extra) for part, extra in zip(zip(*parts, strict=True), (0, 1, 1), strict=True)
     )
@@ -71,6 +70,15 @@ def placed_magnets(body: MagnetBody, position_m: FloatArray, R: FloatArray) -> t
     """Return positions and moments (..., K, 3) of the magnets in the array's frame."""
     places = np.asarray(position_m)[..., None, :] + body.positions_m @ np.swapaxes(R, -1, -2)
     return places, body.moments_Am2 @ np.swapaxes(R, -1, -2)
+
+
+def _magnets_in_array(
+    body: MagnetBody, position_m: FloatArray, R: FloatArray
+) -> Iterator[tuple[Magnet, FloatArray, FloatArray]]:
+    """Yield each magnet with its position and moment (..., 1, 3) in the array's frame."""
+    places, moments = placed_magnets(body, position_m, R)
+    for k, magnet in enumerate(body.magnets):
+        yield magnet, places[..., k, None, :], moments[..., k, None, :]
 
 
 def dipole_fields(
@@ -98,14 +106,12 @@ def _shape_fields(
 
 def body_fields(body: MagnetBody, points_m: FloatArray, position_m: FloatArray, R: FloatArray) -> FloatArray:
     """Return the field (..., N, 3) [T] of a body; for the arguments see :func:`magnet_fields`."""
-    places, moments = placed_magnets(body, position_m, R)
-    parts = []
-    for k, magnet in enumerate(body.magnets):
-        place, moment = places[..., k, None, :], moments[..., k, None, :]
-        if magnet.shape is None:
-            parts.append(dipole.field(points_m, place, moment))
-        else:
-            parts.append(_shape_fields(magnet, magnet.shape, points_m - place, R)[0])
+    parts = [
+        dipole.field(points_m, place, moment)
+        if magnet.shape is None
+        else _shape_fields(magnet, magnet.shape, points_m - place, R)[0]
+        for magnet, place, moment in _magnets_in_array(body, position_m, R)
+    ]
     return np.sum(parts, axis=0)
 
 

@@ -171,8 +171,8 @@ class SourcesPoint:
         In the order of their ids.
     status : str
         "tracked"; "no source"; "no readings"; "misfit": no births, losses or faults explain the readings, and the
-        tracks are predictions; "doubtful": χ² of the last rows together is beyond noise, and another explanation is
-        sought.
+        tracks are predictions; "doubtful": χ² of the last rows together is beyond noise, or was in one of the last 25
+        rows, and another explanation is sought.
     chi2 : float
         χ² of the row given its prediction.
     dof : int

@@ -262,8 +262,8 @@ class ChartFilter:
             return known
         # The mode of all states is biased towards the array, by several σ if the source moves at random by more. Keep
         # the filter's result unless the mode is elsewhere.
-        moves = not self.has_lasting_errors and (_range_motion(found, rows, motions) > found.log_range_sigma).all()
-        near = chdtri(n, CONTRADICTION) if moves else n
+        is_moving = not self.has_lasting_errors and (_range_motion(found, rows, motions) > found.log_range_sigma).all()
+        near = chdtri(n, CONTRADICTION) if is_moving else n
         if not self.has_lasting_errors and len(mixture) > 1:
             # The components describe a curved valley better than a mode.
             best = found.x[np.argmax(found.log_weight)]

@@ -67,7 +67,7 @@ def test_the_true_place_is_kept_beside_another() -> None:
 
 @pytest.mark.parametrize("seed", [2012, 2043])
 def test_a_refit_of_many_rows_is_not_biased_towards_the_array(seed: int) -> None:
-    """Of 56 rows at 1 nT, the mode of all states was 14 % nearer than the source, 5 σ, and replaced the filter's."""
+    """The mode of all states of 56 rows at 1 nT is 14 % nearer than the source, 5 σ; it replaced the filter's."""
     array = tetrahedron(1.5, "vector", 1e-9)
     truth, readings = drawn(WALK, 60, seed, without_lasting_errors(array))
     found_m = track_column(list(Tracker(array, WALK).run(rows_of(readings[:57]))), "position_m", 3)[-1]
