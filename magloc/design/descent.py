@@ -36,6 +36,7 @@ _FIRST_STEP = 0.05
 # A descent has converged if a number of steps gained less than a share of the criterion.
 _PATIENCE, _LEAST_GAIN = 30, 2e-4
 _MOST_SPACING_ROUNDS = 300
+_PARTING = np.array([0.48, 0.60, 0.64])  # a unit vector with a part along every rod and plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +201,8 @@ def move_into_volume(task: Placement, sensors: FloatArray) -> FloatArray:
         close = distance[:, 0] < task.least_spacing_m * (1.0 - 1e-9)
         if not close.any():
             break
-        # Sensors in one place have no direction of separation; use an axis by their numbers.
-        parting = np.where(distance > 1e-12, apart / np.maximum(distance, 1e-12), np.eye(3)[(i + j) % 3])
+        # Points in one place have no direction of separation. With one direction for all pairs no pushes cancel.
+        parting = np.where(distance > 1e-12, apart / np.maximum(distance, 1e-12), _PARTING)
         push = 0.5 * (1.0 + 1e-6) * np.maximum(0.0, task.least_spacing_m - distance) * parting
         moved = inside.copy()
         np.add.at(moved, i, push)
@@ -260,9 +261,10 @@ def _step(
     share = 1.0
     while share > _SHORTEST:
         trial = problem.move_inside(x + share * direction)
-        value, new_slope = problem.log_value_and_slope(trial)
-        if value <= bar + _SUFFICIENT * share * min(steepness, 0.0) and problem.is_spaced(trial):
-            return trial, value, new_slope
+        if problem.is_spaced(trial):
+            value, new_slope = problem.log_value_and_slope(trial)
+            if value <= bar + _SUFFICIENT * share * min(steepness, 0.0):
+                return trial, value, new_slope
         share *= 0.4
     return None
 

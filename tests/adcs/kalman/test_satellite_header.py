@@ -116,7 +116,8 @@ def size_of(filter_: adcs.SatelliteFilter) -> int:
     return filter_.settings.sensors.size
 
 
-@pytest.mark.parametrize(("sensors", "states"), [*SETS, ("mag+sun", ()), ("st+mag+sun", ("field-model",))])
+@pytest.mark.slow_after(3)
+@pytest.mark.parametrize(("sensors", "states"), [("st+mag+sun", ("field-model",)), *SETS, ("mag+sun", ())])
 def test_as_python(sensors: str, states: tuple[str, ...], programs: Path) -> None:
     """With missing and wild readings, commands, and the covariance of some fixes; in float within 0.3 σ."""
     log, filter_ = log_of(), filter_of(sensors, states)

@@ -182,6 +182,14 @@ class TestVolumes:
         assert pdist(apart).min() >= 0.3 * (1.0 - 1e-6)
         np.testing.assert_allclose(volume.nearest(apart), apart, atol=1e-9)
 
+    @pytest.mark.parametrize("axis", range(3))
+    def test_spacing_at_the_end_of_a_rod(self, axis):
+        size = 2.0 * np.eye(3)[axis]
+        task = replace(TASK, volume=BoxVolume((0.0, 0.0, 0.0), tuple(size)), least_spacing_m=0.3)
+        apart = move_into_volume(task, np.tile(3.0 * size, (4, 1)))
+        assert pdist(apart).min() >= 0.3 * (1.0 - 1e-6)
+        np.testing.assert_array_equal(np.delete(apart, axis, axis=1), 0.0)
+
 
 class TestBlock:
     def test_sources_fill_it_and_point_everywhere(self):

@@ -130,7 +130,9 @@ def test_a_bad_row_changes_nothing(program: Path, time_s: float, reading_T: floa
     np.testing.assert_array_equal(np.delete(found, 51, axis=0), run_rows(program, times, readings_T))
 
 
-@pytest.mark.parametrize("count", [3_000, pytest.param(500_000, marks=pytest.mark.slow)])  # half a millisecond each
-def test_random_updates_never_crash(count: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("count", "flags"), [(2_000, ["-DQUICK"]), pytest.param(500_000, [], marks=pytest.mark.slow)]
+)  # half a millisecond each
+def test_random_updates_never_crash(count: int, flags: list[str], tmp_path: Path) -> None:
     """NaN, infinities, numbers of any size, times that go back, and magnets that jump."""
-    check_random_updates(HERE / "random_updates.cpp", count, tmp_path)
+    check_random_updates(HERE / "random_updates.cpp", count, tmp_path, *flags)
