@@ -11,7 +11,9 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 NOT_INSTALLED = { echo "magloc could not be installed: it needs the package index, and a C++ compiler (g++, clang++) or else Zig from that index" >&2; exit 1; }
 
-KERNEL_SOURCES := magloc/core/*.cpp adcs/core/*.cpp docs/examples/*.cpp -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
+# The examples need the headers of the C library, which come with a compiler; kernels need none.
+EXAMPLES = $(shell for name in c++ g++ clang++; do command -v $$name >/dev/null && echo 'docs/examples/*.cpp' && break; done)
+KERNEL_SOURCES = magloc/core/*.cpp adcs/core/*.cpp $(EXAMPLES) -- -std=c++17 -Imagloc/core/include -DMAGLOC_LANES=2
 KERNEL_TESTS := tests/magloc/core tests/magloc/fields/test_points.py
 
 .PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel wheel-aarch64 bench bench-against validation proof docs notebooks pictures chromium lint sanitize clean

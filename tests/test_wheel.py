@@ -15,6 +15,7 @@ import pytest
 
 from magloc import core
 from tests.conftest import REPOSITORY
+from tests.test_core_examples import COMPILER
 from tests.test_house import PACKAGES
 from tests.test_packaging import PROJECT
 from tests.test_portability import names
@@ -53,6 +54,8 @@ def contents(wheel: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    if COMPILER is None:
+        pytest.skip("needs a compiler")
     return contents(made("wheel", REPOSITORY, tmp_path_factory.mktemp("wheel")))
 
 
@@ -61,7 +64,8 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of an sdist."""
     place = tmp_path_factory.mktemp("sdist")
     with tarfile.open(made("sdist", REPOSITORY, place)) as archive:
-        archive.extractall(place, filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # from Python 3.11.4 on
+        archive.extractall(place)
     return next(path for path in place.iterdir() if path.is_dir())
 
 
