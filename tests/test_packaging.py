@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -104,3 +106,16 @@ def numbers(version: str) -> list[int]:
     while found[-1] == 0:
         found.pop()
     return found
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+@pytest.mark.parametrize("compilers", [[], ["g++"]])
+def test_examples_are_checked_where_a_compiler_brings_headers(compilers: list[str], tmp_path: Path) -> None:
+    for name in compilers:
+        (tmp_path / name).touch(mode=0o755)
+    command = [shutil.which("make"), "--dry-run", "style-of-kernels"]
+    done = subprocess.run(
+        command, cwd=REPOSITORY, env={"PATH": str(tmp_path)}, check=True, capture_output=True, encoding="utf-8"
+    )
+    assert "magloc/core/*.cpp" in done.stdout
+    assert ("docs/examples/*.cpp" in done.stdout.splitlines()[-1]) == bool(compilers)
