@@ -8,7 +8,18 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbformat import NotebookNode
-from tests.notebooks import FOLDER, NOTEBOOKS, SHOWN, executed, picture_files, pictures, texts, views, without_views
+from tests.notebooks import (
+    FOLDER,
+    KERNEL_WARNINGS,
+    NOTEBOOKS,
+    SHOWN,
+    executed,
+    picture_files,
+    pictures,
+    texts,
+    views,
+    without_views,
+)
 
 
 LARGEST_BYTES, LARGEST_VIEW_BYTES = 400_000, 1_200_000
@@ -69,7 +80,7 @@ class TestRecordings:
     @pytest.mark.slow
     def test_without_the_recording_a_simulated_twin_tells_the_story(self, name, tmp_path, monkeypatch):
         monkeypatch.delenv("MAGLOC_DATA", raising=False)
-        monkeypatch.setenv("PYTHONWARNINGS", "error")
+        monkeypatch.setenv("PYTHONWARNINGS", KERNEL_WARNINGS)
         path = Path(shutil.copy(FOLDER / f"{name}.ipynb", tmp_path))
         said = texts(executed(path, tmp_path))
         assert "Notice: the recording is not on this machine" in said
