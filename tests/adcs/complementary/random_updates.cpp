@@ -1,5 +1,5 @@
 // Random updates of attitude filters: random_updates COUNT. Prints how many it made, how many were refused, and how
-// many estimates were not finite. With QUICK all are in float, whose range is smaller, as each type is compiled anew.
+// many estimates were not finite. With QUICK only float is tested: each type takes seconds to compile.
 #include <stdio.h>
 #include <stdlib.h>
 

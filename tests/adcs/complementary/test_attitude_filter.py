@@ -296,5 +296,5 @@ class TestConfig:
     ("count", "flags"), [(20_000, ["-DQUICK"]), pytest.param(1_000_000, [], marks=pytest.mark.slow)]
 )
 def test_random_updates_never_crash(count: int, flags: list[str], tmp_path: Path) -> None:
-    """NaN, infinities, numbers of any size and times that go back, in float, and if slow in double."""
+    """NaN, infinities, numbers of any size and times that go back, in float; the slow size also in double."""
     check_random_updates(Path(__file__).with_name("random_updates.cpp"), count, tmp_path, "-O0", *flags)

@@ -1,5 +1,5 @@
 // Random updates of trackers: random_updates COUNT. Prints how many it made, how many were refused, and how many
-// estimates were not finite. With QUICK all trackers have four sensors, as each number of sensors is compiled anew.
+// estimates were not finite. With QUICK all trackers have four sensors: each number takes seconds to compile.
 #include <stdio.h>
 #include <stdlib.h>
 
