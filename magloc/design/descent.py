@@ -201,7 +201,7 @@ def move_into_volume(task: Placement, sensors: FloatArray) -> FloatArray:
         close = distance[:, 0] < task.least_spacing_m * (1.0 - 1e-9)
         if not close.any():
             break
-        # Points in one place have no direction of separation. With one direction for all pairs no pushes cancel.
+        # Points in one place have no direction of separation. One direction for all pairs: their pushes do not cancel.
         parting = np.where(distance > 1e-12, apart / np.maximum(distance, 1e-12), _PARTING)
         push = 0.5 * (1.0 + 1e-6) * np.maximum(0.0, task.least_spacing_m - distance) * parting
         moved = inside.copy()

@@ -118,8 +118,8 @@ class TestDisagreement:
                 row[column] = str(1e3 * float(row[column]))
         truth, readings = tmp_path / "truth.csv", tmp_path / "board.csv"
         truth.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n", encoding="utf-8")
-        kept = (folder / "board.csv").read_text(encoding="utf-8").splitlines(keepends=True)[:31]
-        readings.write_text("".join(kept), encoding="utf-8")
+        first = (folder / "board.csv").read_text(encoding="utf-8").splitlines(keepends=True)[:31]
+        readings.write_text("".join(first), encoding="utf-8")
         out = tmp_path / ("out.toml" if command == "calibrate" else "out")
         array = folder / "board-array.toml"
         outcome = run(command, readings, "--array", array, "--truth", truth, "--out", out)

@@ -40,7 +40,7 @@ ON_PAGES = {"kalman-bank": ("attitude-track.png", 0)}
 LONGEST_CELL_S = 300
 """A cell that compiles what it uses, on slow cores."""
 KERNEL_WARNINGS = "error,ignore:There is no current event loop:DeprecationWarning"
-"""PYTHONWARNINGS of a kernel: ipykernel itself causes the one that is ignored, from Python 3.12 on."""
+"""PYTHONWARNINGS of a kernel: ipykernel itself causes the one that is ignored, with Python 3.13."""
 # Otherwise jupyter_core warns that its folders will move.
 os.environ.setdefault("JUPYTER_PLATFORM_DIRS", "1")
 MOST_PIXELS = 1000
